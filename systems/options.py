@@ -14,7 +14,7 @@ import textwrap
 import tomllib
 import types
 from collections.abc import Callable, Hashable, Mapping, Sequence
-from dataclasses import MISSING, dataclass, field, fields, is_dataclass, replace
+from dataclasses import MISSING, dataclass, field, fields, replace
 from functools import cache
 from inspect import get_annotations
 from operator import attrgetter
@@ -80,28 +80,20 @@ def from_field(kind: type, name: str, default: Any = ..., *, unset: str = "") ->
 
     With another `default`, None say, what the option comes to is what it is there, or `unset`.
     """
-    found = options_of(kind)[name]
+    found: Declaration = cast(Any, kind).__dataclass_fields__[name].metadata[_KEY]
+    shown = options_of(kind)[name]
     if default is ...:
-        return field(default=found.default, metadata={_KEY: found.said})
-    return field(default=default, metadata={_KEY: replace(found.said, unset=unset or found.shown_default)})
+        return field(default=shown.default, metadata={_KEY: found})
+    return field(default=default, metadata={_KEY: replace(found, unset=unset or shown.shown_default)})
 
 
-@dataclass(frozen=True)
-class Option:
+@dataclass(frozen=True, kw_only=True)
+class Option(Declaration):
     """An option of a dataclass: its declaration, and the field's name, type and default (MISSING: it must be given)."""
 
     name: str
     hint: Any
     default: Any
-    said: Declaration
-
-    @property
-    def help(self) -> str:
-        return self.said.help
-
-    @property
-    def section(self) -> str:
-        return self.said.section
 
     @property
     def required(self) -> bool:
@@ -110,14 +102,14 @@ class Option:
     @property
     def key(self) -> str:
         """The name in a file: without unit."""
-        return self.said.words[0].replace("-", "_") if self.said.words else stem_of(self.name)
+        return self.words[0].replace("-", "_") if self.words else stem_of(self.name)
 
     @property
     def flags(self) -> tuple[str, ...]:
         """The names on the command line; none where it is not there."""
-        if self.said.words is None:
+        if self.words is None:
             return ()
-        words = self.said.words or (self.key.replace("_", "-"),)
+        words = self.words or (self.key.replace("_", "-"),)
         return tuple(f"{'-' if len(word) == 1 else '--'}{word}" for word in words)
 
     @property
@@ -142,15 +134,15 @@ class Option:
         return dict
 
     @property
-    def read(self) -> Callable[[str, str], Any] | None:
+    def reader(self) -> Callable[[str, str], Any] | None:
         """What reads a text of it: (text, what to call it) -> value in our unit. None where a text is the value."""
-        return self.said.read or (parser_of(self.name) if self.unit else None)
+        return self.read or (parser_of(self.name) if self.unit else None)
 
     @property
     def shown_default(self) -> str:
-        """The default as the help states it; empty where there is none to state."""
-        if self.said.unset or self.required or self.default is None or self.default is False or self.default == ():
-            return self.said.unset
+        """The default as the help states it; empty where there is none to state, or it must be given."""
+        if self.unset or self.required or self.default is None or self.default is False or self.default == ():
+            return self.unset
         if self.unit and not isinstance(self.default, str):
             return format_quantity(self.name, self.default)
         return ", ".join(map(str, self.default)) if isinstance(self.default, tuple) else str(self.default)
@@ -163,7 +155,7 @@ class Option:
             given = given.tolist() if self.many and hasattr(given, "tolist") else given
         if hasattr(given, "item") and not getattr(given, "ndim", 1):
             given = given.item()
-        if self.read is not None and (given is not None or type(None) not in get_args(self.hint)):
+        if self.reader is not None and (given is not None or type(None) not in get_args(self.hint)):
             several = self.many and isinstance(given, list | tuple)
             value: Any = [self._read(one, what) for one in given] if several else self._read(given, what)
         else:
@@ -180,13 +172,13 @@ class Option:
         if given is None or given == self.default:
             return given
         if isinstance(given, str):
-            return cast(Callable[[str, str], Any], self.read)(given, what)
+            return cast(Callable[[str, str], Any], self.reader)(given, what)
         return quantity(self.name, given, what) if self.unit else given
 
     def check(self, value: Any, what: str) -> None:
         """Raise UnknownNameError or InputError where a value is none of the choices, or outside the bounds."""
         for one in value if isinstance(value, list | tuple) else (value,):
-            choices, (least, most) = self.said.choices, self.said.within
+            choices, (least, most) = self.choices, self.within
             if choices and one is not None and one not in choices:
                 raise UnknownNameError(
                     f"{what} {one!r} is unknown; choose {_listed(choices)}.{nearest(str(one), list(choices))}"
@@ -221,7 +213,10 @@ def _options_of(kind: Hashable) -> dict[str, Option]:
     hints = get_type_hints(made)
     declared = {f.name: f for f in fields(made) if _KEY in f.metadata}
     order = dict.fromkeys(name for each in made.__mro__ for name in get_annotations(each) if name in declared)
-    return {name: Option(name, hints[name], declared[name].default, declared[name].metadata[_KEY]) for name in order}
+    return {
+        name: Option(**vars(declared[name].metadata[_KEY]), name=name, hint=hints[name], default=declared[name].default)
+        for name in order
+    }
 
 
 def check_options(settings: Any) -> None:
@@ -289,40 +284,6 @@ def _meant(key: str, section: str, known: Mapping[str, Option]) -> str:
 def part_of(settings: Any, kind: type[T]) -> T:
     """Return the dataclass `kind` of the fields that `settings`, which has all of them, holds."""
     return kind(**{f.name: getattr(settings, f.name) for f in fields(cast(Any, kind)) if f.init})
-
-
-@dataclass(frozen=True)
-class OptionRow:
-    """An option as a table of the manual shows it. `flag` is empty for those of a `config` file alone, whose table
-    `section` is; `name` is the keyword in Python, `key` the name in a file."""
-
-    name: str
-    flag: str
-    key: str
-    section: str
-    unit: str
-    default: str
-    choices: tuple[str, ...]
-    help: str
-
-
-def option_rows(kind: type) -> list[OptionRow]:
-    """Return the options of a dataclass as rows of a table; 'required' stands for the default of those without."""
-    if not is_dataclass(kind):
-        raise TypeError(f"{kind!r} is no dataclass of options")
-    return [
-        OptionRow(
-            name=found.name,
-            flag=", ".join(found.flags),
-            key=found.key,
-            section=found.section,
-            unit=found.unit,
-            default="required" if found.required else found.shown_default,
-            choices=found.said.choices,
-            help=found.help,
-        )
-        for found in options_of(kind).values()
-    ]
 
 
 def flag_of(name: str) -> str:
@@ -417,7 +378,7 @@ def _documented(known: dict[str, Option]) -> str:
     lines = ["Options, by keyword or in the TOML file `config`:", ""]
     for option in known.values():
         default = "required" if option.required else f"default {shown}" if (shown := option.shown_default) else ""
-        said = [option.unit, " | ".join(option.said.choices), default]
+        said = [option.unit, " | ".join(option.choices), default]
         about = ", ".join(word for word in said if word)
         lines.append(f"{option.name}{f' ({about})' if about else ''}")
         lines += textwrap.wrap(option.help, 112, initial_indent="    ", subsequent_indent="    ")

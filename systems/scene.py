@@ -100,11 +100,7 @@ class Scene:
 
     def neighbours(self) -> list[list[int]]:
         """Return of each atom the atoms that it is bonded to, ascending."""
-        near: list[list[int]] = [[] for _ in range(self.n_atoms)]
-        for i, j in self.bonds.tolist():
-            near[i].append(j)
-            near[j].append(i)
-        return [sorted(around) for around in near]
+        return neighbours_of(self.bonds, self.n_atoms)
 
     @functools.cached_property
     def topology_hash(self) -> str:
@@ -176,6 +172,15 @@ class Scene:
         import mdtraj
 
         return mdtraj.Topology.from_openmm(self.to_openmm_topology())
+
+
+def neighbours_of(bonds: IntArray, n_atoms: int) -> list[list[int]]:
+    """Return of each atom the atoms that it is bonded to, ascending; bonds are `(n_bonds, 2)`."""
+    near: list[list[int]] = [[] for _ in range(n_atoms)]
+    for i, j in bonds.tolist():
+        near[i].append(j)
+        near[j].append(i)
+    return [sorted(around) for around in near]
 
 
 def once_per_scene(function: Callable[Concatenate[Scene, P], T]) -> Callable[Concatenate[Scene, P], T]:

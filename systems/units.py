@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import functools
 import math
 import re
 import sys
 from collections.abc import Callable
 from numbers import Real
-from typing import Any, overload
+from typing import Any, NamedTuple, overload
 
 from systems.errors import UnitError
 
@@ -20,80 +21,75 @@ Quantity = float | str
 
 # Both signs for micro: U+00B5, which keyboards type, and U+03BC, which other programs print.
 _TIME_PS = {"fs": 1e-3, "ps": 1.0, "ns": 1e3, "us": 1e6, "\u00b5s": 1e6, "\u03bcs": 1e6, "ms": 1e9}
-_WALL_S = {"s": 1.0, "min": 60.0, "h": 3600.0}
-# These three mean the same in every MD program, so a bare number is accepted, too.
-_TEMPERATURE_K = {"K": 1.0, "": 1.0}
-_RATE_PER_PS = {"/ps": 1.0, "1/ps": 1.0, "ps^-1": 1.0, "/fs": 1e3, "1/fs": 1e3, "/ns": 1e-3, "1/ns": 1e-3, "": 1.0}
-_LENGTH_NM = {"nm": 1.0, "A": 0.1, "Å": 0.1, "angstrom": 0.1, "pm": 1e-3}
-_MOLAR = {"M": 1.0, "mM": 1e-3, "mol/l": 1.0, "mol/L": 1.0, "": 1.0}
-_MASS_DA = {"Da": 1.0, "u": 1.0, "amu": 1.0, "": 1.0}
-_PRESSURE_BAR = {"bar": 1.0, "atm": 1.01325, "": 1.0}
 _NUMBER = re.compile(r"^\s*([-+]?[0-9.]+(?:[eE][-+]?[0-9]+)?)\s*(\S*)\s*$")
 
 
-def _parse(text: str, table: dict[str, float], what: str, example: str, *, zero: bool = False) -> float:
+class _Dimension(NamedTuple):
+    """The units that a text may have, with what each is in ours; where a bare number means ours, "" is among them.
+
+    `shown`: our unit; `what`, `example`: how messages call such a quantity, and write one; `openmm`: our unit as
+    `openmm.unit` calls it, with its power; `may_be_zero`: whether a text may say so.
+    """
+
+    units: dict[str, float]
+    shown: str
+    what: str
+    example: str
+    openmm: tuple[str, int]
+    may_be_zero: bool = False
+
+
+# By what a name ends in; the longest ending first: a friction ends in _ps, too.
+DIMENSIONS = {
+    # "1/ps" is the number 1 with the unit "/ps", while "1 1/ps" spells the unit out.
+    "_per_ps": _Dimension(
+        {"/ps": 1.0, "1/ps": 1.0, "ps^-1": 1.0, "/fs": 1e3, "1/fs": 1e3, "/ns": 1e-3, "1/ns": 1e-3, "": 1.0},
+        "1/ps", "friction", "1/ps", ("picosecond", -1),
+    ),
+    "_ps": _Dimension(_TIME_PS, "ps", "time", "10ns", ("picosecond", 1)),
+    "_k": _Dimension({"K": 1.0, "": 1.0}, "K", "temperature", "300K", ("kelvin", 1)),
+    "_da": _Dimension({"Da": 1.0, "u": 1.0, "amu": 1.0, "": 1.0}, "Da", "hydrogen mass", "3Da", ("dalton", 1)),
+    "_nm": _Dimension(
+        {"nm": 1.0, "A": 0.1, "Å": 0.1, "angstrom": 0.1, "pm": 1e-3}, "nm", "length", "1nm", ("nanometer", 1)
+    ),
+    "_molar": _Dimension(
+        {"M": 1.0, "mM": 1e-3, "mol/l": 1.0, "mol/L": 1.0, "": 1.0}, "M", "concentration", "0.15M", ("molar", 1), True
+    ),
+    "_bar": _Dimension({"bar": 1.0, "atm": 1.01325, "": 1.0}, "bar", "pressure", "1bar", ("bar", 1)),
+    "_s": _Dimension({"s": 1.0, "min": 60.0, "h": 3600.0}, "s", "budget", "30min", ("second", 1)),
+}  # fmt: skip
+
+
+def _parse(text: str, what: str = "", *, ending: str, zero: bool = False) -> float:
+    """Return the value of a text in our unit. Raises UnitError for a missing, unknown or non-positive quantity."""
+    dimension = DIMENSIONS[ending]
+    what, like = f"{what or dimension.what} {text!r}", f"write it like {dimension.example}"
+    known = ", ".join(unit for unit in dimension.units if unit and unit != "\u03bcs")
     match = _NUMBER.match(text)
-    known = ", ".join(unit for unit in table if unit and unit != "\u03bcs")
     if match is None:
-        raise UnitError(f"{what} {text!r} is not a number with a unit; write it like {example} (units: {known}).")
+        raise UnitError(f"{what} is not a number with a unit; {like} (units: {known}).")
     number, unit = match.groups()
-    if unit not in table:
+    if unit not in dimension.units:
         problem = f"unknown unit {unit!r}" if unit else "no unit"
-        raise UnitError(f"{what} {text!r} has {problem}; write it like {example} (units: {known}).")
+        raise UnitError(f"{what} has {problem}; {like} (units: {known}).")
     try:
-        value = float(number) * table[unit]
+        value = float(number) * dimension.units[unit]
     except ValueError:
-        raise UnitError(f"{what} {text!r} is not a number with a unit; write it like {example}.") from None
+        raise UnitError(f"{what} is not a number with a unit; {like}.") from None
+    zero = zero or dimension.may_be_zero
     if not math.isfinite(value) or value < 0 or (value == 0 and not zero):
-        least = "not negative" if zero else "positive"
-        raise UnitError(f"{what} {text!r} must be {least} and finite; write it like {example}.")
+        raise UnitError(f"{what} must be {'not negative' if zero else 'positive'} and finite; {like}.")
     return value
 
 
-def parse_time_ps(text: str, what: str = "time") -> float:
-    """Return a simulated duration in ps. Raises UnitError for a missing, unknown or non-positive quantity."""
-    return _parse(text, _TIME_PS, what, "10ns")
+def parse_time_ps(text: str, what: str = "") -> float:
+    """Return a simulated duration in ps (`10ns`). Raises UnitError for a missing, unknown or non-positive quantity."""
+    return _parse(text, what, ending="_ps")
 
 
-def parse_time_or_none_ps(text: str, what: str = "time") -> float:
-    """Return a simulated duration in ps, which may be none: `0ps`. Raises UnitError."""
-    return _parse(text, _TIME_PS, what, "100ps", zero=True)
-
-
-def parse_wall_s(text: str, what: str = "budget") -> float:
+def parse_wall_s(text: str, what: str = "") -> float:
     """Return a wall-clock duration in seconds (`30min`, `2h`). Raises UnitError."""
-    return _parse(text, _WALL_S, what, "30min")
-
-
-def parse_temperature_k(text: str, what: str = "temperature") -> float:
-    """Return a temperature in K (`300K` or `300`). Raises UnitError."""
-    return _parse(text, _TEMPERATURE_K, what, "300K")
-
-
-def parse_rate_per_ps(text: str, what: str = "friction") -> float:
-    """Return a rate in 1/ps (`1/ps`, `91/ps`, `0.1/fs` or a bare number). Raises UnitError."""
-    # "1/ps" is the number 1 with the unit "/ps", while "1 1/ps" spells the unit out; both are in the table.
-    return _parse(text, _RATE_PER_PS, what, "1/ps")
-
-
-def parse_mass_da(text: str, what: str = "hydrogen mass") -> float:
-    """Return a mass in dalton (`3Da` or `3`). Raises UnitError."""
-    return _parse(text, _MASS_DA, what, "3Da")
-
-
-def parse_length_nm(text: str, what: str = "length") -> float:
-    """Return a length in nm (`1nm`, `10A`). Raises UnitError for a missing, unknown or non-positive quantity."""
-    return _parse(text, _LENGTH_NM, what, "1nm")
-
-
-def parse_molar(text: str, what: str = "concentration") -> float:
-    """Return a concentration in mol/l (`0.15M`, `150mM`, `0.15` or `0`). Raises UnitError."""
-    return _parse(text, _MOLAR, what, "0.15M", zero=True)
-
-
-def parse_pressure_bar(text: str, what: str = "pressure") -> float:
-    """Return a pressure in bar (`1bar`, `1atm` or `1`). Raises UnitError."""
-    return _parse(text, _PRESSURE_BAR, what, "1bar")
+    return _parse(text, what, ending="_s")
 
 
 def format_wall(seconds: float) -> str:
@@ -104,53 +100,24 @@ def format_wall(seconds: float) -> str:
     return f"{seconds / 86_400.0:.3g} days"
 
 
-# By what a name ends in; the longest ending first: a friction ends in _ps, too.
-PARSERS: dict[str, Callable[[str, str], float]] = {
-    "_per_ps": parse_rate_per_ps,
-    "_ps": parse_time_ps,
-    "_k": parse_temperature_k,
-    "_da": parse_mass_da,
-    "_nm": parse_length_nm,
-    "_molar": parse_molar,
-    "_bar": parse_pressure_bar,
-    "_s": parse_wall_s,
-}
-
-_UNITS = {"_per_ps": "1/ps", "_ps": "ps", "_k": "K", "_da": "Da", "_nm": "nm", "_molar": "M", "_bar": "bar", "_s": "s"}
-
-
 def parser_of(name: str) -> Callable[[str, str], float]:
     """Return what reads the text of a setting by its name (`time_ps`): text and what to call it -> its value inside."""
-    if name == "equilibrate_ps":
-        return parse_time_or_none_ps
-    return next(parse for ending, parse in PARSERS.items() if name.endswith(ending))
+    return functools.partial(_parse, ending=_ending(name), zero=name == "equilibrate_ps")
 
 
 def _ending(name: str) -> str:
-    return next((ending for ending in PARSERS if name.endswith(ending)), "")
+    return next((ending for ending in DIMENSIONS if name.endswith(ending)), "")
 
 
 def unit_of(name: str) -> str:
     """Return the unit that a setting's name ends in (`ps` of `time_ps`), or an empty string."""
-    return _UNITS.get(_ending(name), "")
+    ending = _ending(name)
+    return DIMENSIONS[ending].shown if ending else ""
 
 
 def stem_of(name: str) -> str:
     """Return a setting's name without its unit: `time` of `time_ps`."""
     return name.removesuffix(_ending(name))
-
-
-# The units of the endings as `openmm.unit` calls them, with their powers.
-_OPENMM = {
-    "_per_ps": ("picosecond", -1),
-    "_ps": ("picosecond", 1),
-    "_k": ("kelvin", 1),
-    "_da": ("dalton", 1),
-    "_nm": ("nanometer", 1),
-    "_molar": ("molar", 1),
-    "_bar": ("bar", 1),
-    "_s": ("second", 1),
-}
 
 
 def is_openmm_quantity(value: Any) -> bool:
@@ -168,12 +135,12 @@ def openmm_number(name: str, value: Any, what: str = "") -> Any:
         raise UnitError(f"{what} = {value} has a unit, and takes none.")
     # Whoever holds a quantity has imported its module.
     units = sys.modules[type(value).__module__.rpartition(".")[0]]
-    unit, power = _OPENMM[ending]
+    unit, power = DIMENSIONS[ending].openmm
     try:
         return value.value_in_unit(getattr(units, unit) ** power)
     except TypeError:
         raise UnitError(
-            f"{what} = {value} cannot be turned into {_UNITS[ending]}; give a quantity of that dimension."
+            f"{what} = {value} cannot be turned into {unit_of(name)}; give a quantity of that dimension."
         ) from None
 
 

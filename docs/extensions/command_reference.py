@@ -55,13 +55,15 @@ def _plain(text: str) -> str:
 
 def file_rows(words: list[str]) -> list[tuple[str, str]]:
     """Return (table and key, what it says) of each option of a verb that the command line has no flag for."""
-    from surrogate.verbs.options import VERB_OPTIONS, verb_option_rows
+    from surrogate.verbs.options import VERB_OPTIONS
+    from systems.options import options_of
 
-    rows = verb_option_rows(words[0]) if words[0] in VERB_OPTIONS else []
+    rows = options_of(VERB_OPTIONS[words[0]]).values() if words[0] in VERB_OPTIONS else ()
     found = []
-    for row in (row for row in rows if not row.flag):
+    for row in (row for row in rows if not row.flags):
         choices = f" One of {', '.join(row.choices)}." if row.choices else ""
-        default = f" [default: {row.default}]" if row.default else ""
+        shown = "required" if row.required else row.shown_default
+        default = f" [default: {shown}]" if shown else ""
         found.append((f"[{row.section}] {row.key}" if row.section else row.key, f"{row.help}{choices}{default}"))
     return found
 

@@ -1,5 +1,5 @@
-"""The directives `definitions`, `metrics`, `flags` and `formats`: what the code says of the comparison's terms and
-metrics, of frames' flags and of other programs' files, as tables."""
+"""The directives `definitions`, `metrics` and `flags`: what the code says of the comparison's terms and metrics, and of
+frames' flags, as tables."""
 
 from __future__ import annotations
 
@@ -50,15 +50,6 @@ class FlagsTable(SphinxDirective):
         return self.parse_text_to_nodes("\n".join(lines))
 
 
-class FormatTable(SphinxDirective):
-    """`{formats}`: the formats that are read, and what their files state."""
-
-    def run(self) -> list[nodes.Node]:
-        from systems.trajectory.foreign_scenes import markdown
-
-        return self.parse_text_to_nodes(markdown())
-
-
 def _plain(text: str) -> str:
     """Return a text in which nothing is Markdown."""
     return "".join("\\" + c if c in "\\`*_[]<>|$" else c for c in text)
@@ -69,5 +60,4 @@ def setup(app: Sphinx) -> dict[str, Any]:
     app.add_directive("definitions", Definitions)
     app.add_directive("metrics", MetricsTable)
     app.add_directive("flags", FlagsTable)
-    app.add_directive("formats", FormatTable)
     return {"parallel_read_safe": True}

@@ -19,7 +19,7 @@ from systems.files.outside import content
 from systems.files.schema import built, fitted, parsed
 from systems.library.named_scenes import find_protocol
 from systems.options import Option, Preparation, options_of
-from systems.units import parse_temperature_k, parse_wall_s, parser_of
+from systems.units import parse_wall_s, parser_of, quantity
 
 T = TypeVar("T")
 SCENE_FILES = (".pdb", ".ent", ".cif", ".mmcif", ".gz", ".sdf", ".mol", ".mol2")
@@ -288,7 +288,7 @@ def _scene_spec(head: _SceneHead, preparation: dict[str, Any], base: Path, where
     elif not _kind(source):
         from systems.library import named_scenes
 
-        named_scenes.describe(source)  # an unknown name is refused now, with the nearest
+        named_scenes.entry(source)  # an unknown name is refused now, with the nearest
     if head.name and not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9._+-]{0,99}", head.name):
         raise InputError(f"{where}name = {head.name!r} must be letters, digits and . _ + - (it names files).")
     return SceneSpec(head.name or name_of(source), source, digest, preparation)
@@ -329,7 +329,7 @@ def _runs_of(spec: SceneSpec, shared: Settings, own: Settings, head: _Head) -> l
         raise InputError("give temperature or temperatures, not both.")
     replicas, temperatures = axes.get("replicas", 1), [values["temperature_k"]]
     if "temperatures" in axes:
-        temperatures = [parse_temperature_k(str(entry), "temperatures") for entry in axes["temperatures"]]
+        temperatures = [quantity("temperature_k", str(entry), "temperatures") for entry in axes["temperatures"]]
     if not 0 < replicas * len(temperatures) <= _MOST_RUNS:
         raise InputError(f"{replicas} x {len(temperatures)} temperatures: from 1 to {_MOST_RUNS} runs are made.")
     runs = []

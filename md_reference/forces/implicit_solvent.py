@@ -8,7 +8,7 @@ import networkx as nx
 import numpy as np
 import numpy.typing as npt
 
-from systems.chemistry.symmetry import bonded_graph
+from systems.chemistry.graph import bonded_graph
 from systems.scene import Scene
 
 # Amber's radius set mbondi3: hydrogens on the guanidinium of arginine, in nm.

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from systems.chemistry.distance_bonds import changed_bond
-from systems.chemistry.geometry_rules import changed_stereo
+from systems.chemistry.validity import changed_stereo
 from systems.errors import PreparationError, first_line
 from systems.scene import FloatArray, Scene
 

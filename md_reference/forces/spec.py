@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from systems.errors import InputError, PreparationError, UnknownNameError, nearest
 from systems.options import check_options, option
-from systems.units import parse_mass_da
+from systems.units import quantity
 
 if TYPE_CHECKING:
     from systems.scene import Scene
@@ -30,7 +30,7 @@ SOLVENTS = (*IMPLICIT_SOLVENTS, *EXPLICIT_SOLVENTS, *QUANTUM_SOLVENTS, "vacuum",
 
 def parse_hydrogen_mass_da(text: str, what: str = "hydrogen mass") -> float | None:
     """Return the hydrogen mass in dalton, or None where natural masses are asked for. Raises UnitError."""
-    return None if text in ("natural", "none") else parse_mass_da(text, what)
+    return None if text in ("natural", "none") else quantity("hydrogen_mass_da", text, what)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -248,9 +248,9 @@ def _decisive(name: str, protocol: str | None) -> tuple[dict[str, Any], tuple[st
     """Return the settings that come before the program's defaults, and how they and their source are called."""
     from systems.library import named_scenes  # loads NumPy, for which help need not wait
 
-    own = named_scenes.own_settings(name) if named_scenes.knows(name) else {}
+    own = dict(named_scenes.entry(name).own_settings) if named_scenes.knows(name) else {}
     if protocol is None:
-        return own, ("by the system's own settings", named_scenes.source_of_settings(name) if own else "")
+        return own, ("by the system's own settings", named_scenes.entry(name).source if own else "")
     if own:
         raise InputError(f"{name} brings its own law and its own settings; leave `protocol` out.")
     found = named_scenes.find_protocol(protocol)

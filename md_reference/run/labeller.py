@@ -21,8 +21,8 @@ from md_reference.run.config import Conditions
 from md_reference.run.engine import Engine
 from md_reference.run.machine import available_cores
 from systems.chemistry.distance_bonds import changed_bond
-from systems.chemistry.geometry_rules import changed_stereo
 from systems.chemistry.graph import turn_torsions
+from systems.chemistry.validity import changed_stereo
 from systems.errors import PreparationError, SimulationError
 from systems.interrupts import end_with_parent
 from systems.scene import FloatArray, Scene

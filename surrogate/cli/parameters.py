@@ -130,12 +130,12 @@ def _keyword(name: str, kind: Any, default: Any, option: Any) -> inspect.Paramet
 
 def _parameter(found: Option) -> inspect.Parameter:
     """Return an option as typer takes it: None where it is left out, so that a file may give it."""
-    kind: Any = str if found.read is not None else found.kind
-    if found.said.choices:
+    kind: Any = str if found.reader is not None else found.kind
+    if found.choices:
         enumeration: Any = StrEnum  # called by its functional form, which mypy takes with literal names alone
-        kind = enumeration(found.name, {choice: choice for choice in found.said.choices})
+        kind = enumeration(found.name, {choice: choice for choice in found.choices})
     default = "required" if found.required else f"default: {text}" if (text := found.shown_default) else ""
-    least, most = found.said.within if kind in (int, float) else (None, None)
+    least, most = found.within if kind in (int, float) else (None, None)
     option = typer.Option(
         *found.flags,
         help=literal(f"{found.help} [{default}]" if default else found.help),

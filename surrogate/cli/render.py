@@ -59,7 +59,7 @@ def _plain(value: Any, digits: int = 6) -> str:
 
 def print_library(entries: list[dict[str, Any]]) -> None:
     """Print the named scenes in their groups, a line each, and what can be had besides."""
-    from systems.library.named_scenes import on_demand
+    from systems.library.named_scenes import ON_DEMAND
 
     group = ""
     for entry in entries:
@@ -68,7 +68,7 @@ def print_library(entries: list[dict[str, Any]]) -> None:
             group = entry["group"]
         size = f"{entry['n_atoms']:>4} atoms  {entry['formula']}"
         _say(f"  {entry['name']:<20} {size:<26} {entry['title']}")
-    _say(f"{chr(10)}{on_demand()}")
+    _say(f"{chr(10)}{ON_DEMAND}")
 
 
 def print_written(paths: list[Path], as_json: bool, quiet: bool) -> None:

@@ -22,8 +22,7 @@ from surrogate.models.peptides.layout import PeptideConfig, chain_features, stan
 from surrogate.models.peptides.model import PeptideSlide
 from surrogate.models.potential import Potential
 from surrogate.models.weights import load_weights, read_header
-from systems.chemistry.graph import bonded_graph, rotatable_torsions
-from systems.chemistry.matching import match_atoms
+from systems.chemistry.graph import bonded_graph, match_atoms, rotatable_torsions
 from systems.chemistry.validity import INVALID, NOT_FINITE, Geometry, check_frames, flag_names, geometry_from_scene
 from systems.errors import InputError, OutOfDomainError
 from systems.scene import Scene

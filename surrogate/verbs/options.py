@@ -10,7 +10,7 @@ from typing import Any
 from md_reference.forces.spec import ForceFieldSpec, WaterBox
 from md_reference.run.config import MDConfig
 from surrogate.sampling.config import RolloutConfig
-from systems.options import OptionRow, Preparation, from_field, option, option_rows
+from systems.options import Preparation, from_field, option
 from systems.units import Quantity, parse_time_ps
 
 PathLike = str | Path
@@ -228,8 +228,3 @@ VERB_OPTIONS: dict[str, type] = {
     "compare": CompareOptions,
     "run": RunOptions,
 }
-
-
-def verb_option_rows(verb: str) -> list[OptionRow]:
-    """Return the options of a verb as rows of a table, for the manual."""
-    return option_rows(VERB_OPTIONS[verb])

@@ -32,7 +32,7 @@ def _describe(name: str, *, whole: bool) -> dict[str, Any]:
     scene = named_scenes.load(name)
     record: dict[str, Any] = {
         "name": name,
-        "title": named_scenes.describe(name),
+        "title": named_scenes.entry(name).title,
         "n_atoms": scene.n_atoms,
         "formula": scene.formula,
     }
@@ -49,13 +49,13 @@ def _describe(name: str, *, whole: bool) -> dict[str, Any]:
             "torsions": {key: len(quads) for key, quads in backbone_torsions(scene).items() if len(quads)},
             "topology_hash": scene.topology_hash,
             "molecule_key": molecule_key(scene),
-            "protocols": {each: _written(find_protocol(each).settings) for each in named_scenes.protocols(name)},
+            "protocols": {each: _written(find_protocol(each).settings) for each in named_scenes.entry(name).protocols},
         }
         if scene.interactions is not None:
             record |= {
                 "law": scene.interactions,
-                "settings": _written(named_scenes.own_settings(name)),
-                "source": named_scenes.source_of_settings(name),
+                "settings": _written(named_scenes.entry(name).own_settings),
+                "source": named_scenes.entry(name).source,
             }
     return record
 

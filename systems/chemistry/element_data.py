@@ -58,17 +58,12 @@ def is_metal(symbol: str) -> bool:
 def _element(symbol: str) -> Any:
     if not is_element(symbol):
         raise KeyError(symbol)
-    return _element_class()(symbol)
-
-
-@cache
-def _element_class() -> Any:
     # A Ctrl-C while gemmi is imported would abort the process.
     with deferred_interrupt() as asked:
         from gemmi import Element
     if asked():
         raise KeyboardInterrupt
-    return Element
+    return Element(symbol)
 
 
 def is_lone_ion(symbol: str) -> bool:

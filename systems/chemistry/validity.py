@@ -1,14 +1,12 @@
-"""Validity of frames: NumPy checks of bonds, clashes, chirality and planarity, for guards and for the comparison.
-
-For guards also limits of a reference's frames: angles, flat centres, jumps, stillness and drift. Every one is measured
-on the reference: the farthest that its frames go from their mean, and half as far again; the least that they change
-from one to the next, and a third of it.
+"""Validity of frames: NumPy checks of bonds, clashes, chirality and planarity, for guards and for the comparison, by
+the geometry of a scene or of reference frames. For guards also limits of angles, flat centres, jumps, stillness and
+drift: the farthest that the reference goes from its mean, and half as far again; the least it changes, and a third.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Annotated, Any
 
@@ -16,20 +14,28 @@ import numpy as np
 import numpy.typing as npt
 
 from systems.chemistry.geometry import column_blocks, cross, signed_volume, squared_distance, torsion_cosine
-from systems.chemistry.geometry_rules import (
-    HALF_ANGSTROM_NM,
-    MAX_PAIRS,
-    RING_BENT_COSINE,
-    find_rules,
-    measured_rules,
-    n_pairs,
-)
 from systems.errors import InputError
 from systems.files.schema import Recorded
 from systems.scene import Scene
 
 FloatArray = npt.NDArray[np.floating[Any]]
 IntArray = npt.NDArray[np.int64]
+
+HALF_ANGSTROM_NM = 0.05
+RING_BENT_COSINE = 0.5
+MAX_PAIRS = 40_000
+_RING_PLANAR_COSINE = float(np.cos(np.deg2rad(20.0)))
+_TOLERATED_SHARE = 1e-3
+# Between hydrogens, hydrogen and heavy atom, heavy atoms; nm. At most: the lengths of the shortest hydrogen bonds.
+_CLASH_WITHOUT_FRAMES_NM = (0.1, 0.1, 0.2)
+CLASH_AT_MOST_NM = (0.14, 0.14, 0.24)
+_CLASH_SHARE_OF_LEAST = 0.8
+# Of unit vectors to three neighbours: 0.77 where a fourth is missing, 0 where there is none.
+_PYRAMID = 0.4
+_FRAMES_FOR_SHAPE = 200
+# What is flatter than this has no handedness: a signed volume, a torsion's cosine.
+_FLAT_NM3 = 2e-4
+_FLAT_COSINE = 0.1
 
 NOT_FINITE = 1
 BOND_HALF_ANGSTROM = 2
@@ -38,7 +44,7 @@ CLASH = 8
 CHIRALITY = 16
 OMEGA = 32
 RING = 64
-# What guards watch beyond that while rolling (systems.chemistry.validity); they are no part of INVALID.
+# What guards watch beyond that while rolling; they are no part of INVALID.
 ANGLE = 128
 PLANARITY = 256
 JUMP = 512
@@ -107,11 +113,13 @@ class Geometry(Recorded):
         """The least distance in nm of each pair in `clash_idx`, `(k,)`."""
         return self.pair_min_nm(self.clash_idx)
 
+    def n_heavy(self, pairs: IntArray) -> IntArray:
+        """Return how many of each of the pairs `(k, 2)` are no hydrogens."""
+        return np.asarray(2 - self.hydrogen[pairs].sum(axis=1))
+
     def pair_min_nm(self, pairs: IntArray) -> FloatArray:
         """Return the least distance in nm for pairs `(k, 2)`."""
-        n_heavy = 2 - self.hydrogen[pairs].sum(axis=1)
-        least: FloatArray = self.clash_min_nm[n_heavy]
-        return least
+        return np.asarray(self.clash_min_nm[self.n_heavy(pairs)])
 
     @cached_property
     def near_keys(self) -> IntArray:
@@ -126,7 +134,24 @@ def geometry_from_scene(scene: Scene) -> Geometry:
     bonds apart: the closest that unbonded heavy atoms come is the 0.24 nm of strong hydrogen bonds, and hydrogen
     comes no closer than 0.15 nm to an acceptor, so no thermal frame is called a clash, and fused atoms are.
     """
-    return Geometry(**find_rules(scene))
+    from systems.chemistry.graph import exclusions, stereocentres
+
+    start = np.ascontiguousarray(scene.positions_nm.T[:, :, None])
+    stereo_idx, omega_idx = stereocentres(scene), _stiff_torsions(scene)
+    return Geometry(
+        hydrogen=np.array([int(e == "H") for e in scene.elements], dtype=np.int64),
+        bond_idx=scene.bonds,
+        bond_mean_nm=np.sqrt(squared_distance(start, scene.bonds)[:, 0]),
+        bond_std_nm=np.zeros(len(scene.bonds)),
+        near_idx=exclusions(scene, depth=3),
+        # The particles of a model system have no size.
+        clash_min_nm=np.array(_CLASH_WITHOUT_FRAMES_NM) if scene.interactions is None else np.zeros(3),
+        stereo_idx=stereo_idx,
+        stereo_sign=np.where(signed_volume(start, stereo_idx)[:, 0] > 0, 1, -1),
+        omega_idx=omega_idx,
+        omega_sign=np.where(torsion_cosine(start, omega_idx)[:, 0] > 0, 1, -1),
+        ring_idx=_flat_ring_torsions(scene, lambda quads: torsion_cosine(start, quads)[:, 0]),
+    )
 
 
 def geometry_from_frames(scene: Scene, positions_nm: npt.ArrayLike) -> Geometry:
@@ -138,21 +163,199 @@ def geometry_from_frames(scene: Scene, positions_nm: npt.ArrayLike) -> Geometry:
     with a hydrogen: the lengths of the shortest hydrogen bonds, which a short reference need not have visited.
     Raises InputError when no finite frame fits the scene.
     """
-    positions = np.asarray(positions_nm)
-    if positions.ndim != 3 or positions.shape[1:] != (scene.n_atoms, 3):
-        raise InputError(f"Reference frames have shape {positions.shape}, not (n_frames, {scene.n_atoms}, 3).")
-    return Geometry(**measured_rules(scene, positions))
+    frames = np.asarray(positions_nm)
+    if frames.ndim != 3 or frames.shape[1:] != (scene.n_atoms, 3):
+        raise InputError(f"Reference frames have shape {frames.shape}, not (n_frames, {scene.n_atoms}, 3).")
+    finite = np.isfinite(frames).all(axis=(1, 2))
+    if not finite.any():
+        raise InputError("None of the reference frames is finite.")
+    frames = frames if finite.all() else frames[finite]
+    plain = geometry_from_scene(scene)
+    ring_idx = _flat_ring_torsions(scene, lambda quads: _means(frames, quads))
+    bonds, omega_idx = plain.bond_idx, plain.omega_idx
+    stereo_idx = np.concatenate([plain.stereo_idx, centres_without_hydrogen(scene, frames)])
+    mean, std = _bond_lengths(frames, bonds)
+    pairs: list[IntArray] = []
+    if n_pairs(scene.n_atoms) <= MAX_PAIRS:
+        n_heavy = plain.n_heavy(plain.clash_idx)
+        pairs = [plain.clash_idx[n_heavy == n] for n in range(3)]
+    n_broken, n_positive = np.zeros(len(bonds)), np.zeros(len(stereo_idx))
+    n_cis, n_bent = np.zeros(len(omega_idx)), np.zeros(len(ring_idx))
+    least = np.full((3, len(frames)), np.inf)
+    for start, columns in column_blocks(frames, max([len(p) for p in pairs], default=0)):
+        stop = start + columns.shape[2]
+        length = np.sqrt(squared_distance(columns, bonds))
+        n_broken += (np.abs(length - mean[:, None]) > HALF_ANGSTROM_NM).sum(axis=1)
+        n_positive += (signed_volume(columns, stereo_idx) > 0).sum(axis=1)
+        n_cis += (torsion_cosine(columns, omega_idx) > 0).sum(axis=1)
+        n_bent += (torsion_cosine(columns, ring_idx) < RING_BENT_COSINE).sum(axis=1)
+        for n, idx in enumerate(pairs):
+            if len(idx):
+                least[n, start:stop] = np.sqrt(squared_distance(columns, idx).min(axis=0))
+    n = len(frames)
+    excluded: list[str] = []
+
+    def kept(rows: IntArray, n_changed: FloatArray, what: str) -> npt.NDArray[np.bool_]:
+        """Return which rows the reference keeps, and note the others."""
+        share = n_changed / n
+        for row, part in zip(rows.tolist(), share.tolist(), strict=True):
+            if part > _TOLERATED_SHARE:
+                atoms = row[:1] if what == "stereocentre" else row
+                names, numbers = "-".join(scene.atom_names[i] for i in atoms), ", ".join(str(i + 1) for i in atoms)
+                excluded.append(f"{what} {names} (atom {numbers}): changes in {100 * part:.2g} % of the reference")
+        return np.asarray(share <= _TOLERATED_SHARE)
+
+    keep_bond = kept(bonds, n_broken, "bond")
+    keep_stereo = kept(stereo_idx, np.minimum(n_positive, n - n_positive), "stereocentre")
+    keep_omega = kept(omega_idx, np.minimum(n_cis, n - n_cis), "peptide or double bond torsion")
+    keep_ring = kept(ring_idx, n_bent, "ring torsion")
+    clash_min_nm = plain.clash_min_nm
+    if pairs and scene.interactions is None:
+        seen = np.quantile(least, _TOLERATED_SHARE, axis=1, method="lower")
+        clash_min_nm = np.minimum(_CLASH_SHARE_OF_LEAST * seen, CLASH_AT_MOST_NM)
+    return replace(
+        plain, bond_idx=bonds[keep_bond], bond_mean_nm=mean[keep_bond], bond_std_nm=std[keep_bond],
+        clash_min_nm=clash_min_nm, stereo_idx=stereo_idx[keep_stereo],
+        stereo_sign=np.where(2 * n_positive > n, 1, -1)[keep_stereo], omega_idx=omega_idx[keep_omega],
+        omega_sign=np.where(2 * n_cis > n, 1, -1)[keep_omega], ring_idx=ring_idx[keep_ring], excluded=tuple(excluded),
+    )  # fmt: skip
+
+
+def n_pairs(n_atoms: int) -> int:
+    """Number of pairs among `n_atoms` atoms."""
+    return n_atoms * (n_atoms - 1) // 2
+
+
+def changed_stereo(scene: Scene, positions_nm: FloatArray) -> list[str]:
+    """Return of each state `(n_states, n_atoms, 3)` nm what of the scene's handedness it has not, in words, empty where
+    it has all: a stereocentre turned over, or a double bond gone from cis to trans or back. What the scene has flat may
+    go either way; amides turn without becoming another molecule."""
+    from systems.chemistry.graph import stereocentres
+
+    centres, torsions = stereocentres(scene), _stiff_torsions(scene)
+    order = {frozenset(b): o for b, o in zip(scene.bonds.tolist(), scene.bond_orders.tolist(), strict=True)}
+    double = [k for k, (_, i, j, _) in enumerate(torsions.tolist()) if order.get(frozenset((i, j))) == 2.0]
+    torsions = torsions[double]
+    start, states = (np.moveaxis(np.asarray(x, dtype=np.float64), 0, -1).swapaxes(0, 1) for x in
+                     (scene.positions_nm[None], positions_nm))  # fmt: skip
+    volume, cosine = signed_volume(start, centres), torsion_cosine(start, torsions)
+    wrong_centre = (np.abs(volume) > _FLAT_NM3) & (volume * signed_volume(states, centres) < 0)
+    wrong_bond = (np.abs(cosine) > _FLAT_COSINE) & (cosine * torsion_cosine(states, torsions) < 0)
+    name, found = scene.atom_names, [""] * len(positions_nm)
+    for state in np.flatnonzero(wrong_centre.any(axis=0) | wrong_bond.any(axis=0)).tolist():
+        if wrong_centre[:, state].any():
+            found[state] = f"the stereocentre {name[int(centres[wrong_centre[:, state], 0][0])]} turns over"
+        else:
+            i, j = torsions[wrong_bond[:, state]][0, 1:3].tolist()
+            found[state] = f"the double bond {name[i]} - {name[j]} turns from cis to trans or back"
+    return found
+
+
+def centres_without_hydrogen(scene: Scene, positions_nm: FloatArray) -> IntArray:
+    """Return rows (centre, a, b, c), `(k, 4)`, of carbons whose hydrogen is not in the scene: three neighbours of three
+    kinds, and not flat in frames `(n_frames, n_atoms, 3)` nm.
+
+    The fourth neighbour lies where the three leave room, so that the sign of their volume is the handedness.
+    """
+    from systems.chemistry.graph import atom_classes
+
+    neighbours = scene.neighbours()
+    rows = [(i, *around) for i, around in enumerate(neighbours) if scene.elements[i] == "C" and len(around) == 3]
+    if not rows:
+        return np.empty((0, 4), dtype=np.int64)
+    found = np.array(rows, dtype=np.int64)
+    frames = positions_nm[:: max(1, len(positions_nm) // _FRAMES_FOR_SHAPE)].astype(np.float64)
+    arms = frames[:, found[:, 1:]] - frames[:, found[:, :1]]
+    arms /= np.maximum(np.linalg.norm(arms, axis=-1, keepdims=True), 1e-9)
+    found = found[np.abs(np.linalg.det(arms).mean(axis=0)) > _PYRAMID]
+    classes = atom_classes(scene)
+    return found[[len(set(classes[row[1:]].tolist())) == 3 for row in found]].reshape(-1, 4)
+
+
+def _bond_lengths(frames: FloatArray, bonds: IntArray) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
+    total, squares = np.zeros(len(bonds)), np.zeros(len(bonds))
+    for _, columns in column_blocks(frames, len(bonds)):
+        square = squared_distance(columns, bonds).astype(np.float64)
+        total += np.sqrt(square).sum(axis=1)
+        squares += square.sum(axis=1)
+    mean = total / len(frames)
+    return mean, np.sqrt(np.maximum(squares / len(frames) - mean**2, 0.0))
+
+
+def _means(frames: FloatArray, quads: IntArray) -> FloatArray:
+    total = np.zeros(len(quads))
+    for _, columns in column_blocks(frames, len(quads)):
+        total += torsion_cosine(columns, quads).sum(axis=1)
+    return total / len(frames)
+
+
+def _stiff_torsions(scene: Scene) -> IntArray:
+    """Peptide torsions and torsions about double bonds outside rings whose ends tell cis from trans, `(k, 4)`."""
+    from systems.chemistry.graph import atom_classes, backbone_torsions, bonded_graph, ring_bonds
+
+    graph, classes = bonded_graph(scene), atom_classes(scene)
+    in_ring = {tuple(row) for row in ring_bonds(scene).tolist()}
+    rows = backbone_torsions(scene)["omega"].tolist()
+    for (b, c), order in zip(scene.bonds.tolist(), scene.bond_orders.tolist(), strict=True):
+        ends = [[j for j in graph[b] if j != c], [j for j in graph[c] if j != b]]
+        distinct = all(end and len({int(classes[j]) for j in end}) == len(end) for end in ends)
+        if order == 2 and (b, c) not in in_ring and distinct and max(map(len, ends)) <= 2:
+            rows.append([max(ends[0], key=lambda j: classes[j]), b, c, max(ends[1], key=lambda j: classes[j])])
+    return np.array(rows, dtype=np.int64).reshape(-1, 4)
+
+
+def _flat_ring_torsions(scene: Scene, mean_cosine: Callable[[IntArray], FloatArray]) -> IntArray:
+    """Torsions `(k, 4)` inside rings of 4 to 7 atoms with at most three neighbours each that are planar.
+
+    `mean_cosine(quads)` gives the mean cosine of each torsion; a ring is planar when none lies beyond 20°.
+    """
+    rows: list[tuple[int, ...]] = []
+    for cycle in small_rings(scene, most_neighbours=3):
+        torsions = [tuple(cycle[(k + m) % len(cycle)] for m in range(4)) for k in range(len(cycle))]
+        if (mean_cosine(np.array(torsions, dtype=np.int64)) > _RING_PLANAR_COSINE).all():
+            rows.extend(torsions)
+    return np.array(rows, dtype=np.int64).reshape(-1, 4)
+
+
+def small_rings(scene: Scene, *, most_neighbours: int | None = None) -> list[list[int]]:
+    """Return the rings of 4 to 7 atoms, atoms in order: the smallest ring of each bond.
+
+    `most_neighbours` leaves out rings with an atom of more neighbours.
+    """
+    from systems.chemistry.graph import bonded_graph, ring_bonds
+
+    graph = bonded_graph(scene)
+    rings: dict[frozenset[int], list[int]] = {}
+    for i, j in ring_bonds(scene).tolist():
+        before = {i: i}
+        layer = [i]
+        for _ in range(6):  # breadth first from i to j without the bond itself
+            layer = [
+                step
+                for atom in layer
+                for step in graph[atom]
+                if {atom, step} != {i, j} and step not in before and before.setdefault(step, atom) == atom
+            ]
+        if j in before:
+            ring = [j]
+            while ring[-1] != i:
+                ring.append(before[ring[-1]])
+            crowded = most_neighbours is not None and any(graph.degree(atom) > most_neighbours for atom in ring)
+            if 4 <= len(ring) <= 7 and not crowded:
+                rings.setdefault(frozenset(ring), ring)
+    return list(rings.values())
+
+
+# ---- checks of frames -----------------------------------------------------------------------------------------------
 
 
 def check_frames(positions_nm: npt.ArrayLike, geometry: Geometry) -> npt.NDArray[np.uint16]:
     """Return validity bits `(n_frames,)` of frames `(n_frames, n_atoms, 3)` nm (or one frame); 0 is a valid frame.
 
-    NOT_FINITE: a coordinate is NaN or infinite. BOND_HALF_ANGSTROM: a bond is more than 0.05 nm from its mean (the
-    stability rule of Fu et al., Forces are not enough, TMLR 2023). BOND_20_PERCENT: more than 20 % from it; the
-    stricter warning, which INVALID leaves out. CLASH: atoms more than three bonds apart nearer than the geometry
-    allows. CHIRALITY: a stereocentre is inverted or flat. OMEGA: a peptide or double bond has gone from cis to trans or
-    back. RING: a torsion inside a planar ring beyond 60°. Raises InputError when the frames do not have the geometry's
-    atoms.
+    BOND_HALF_ANGSTROM: a bond is more than 0.05 nm from its mean (the stability rule of Fu et al., Forces are not
+    enough, TMLR 2023). BOND_20_PERCENT: more than 20 %; INVALID leaves it out. CLASH: atoms more than three bonds apart
+    nearer than the geometry allows. CHIRALITY: a stereocentre is inverted or flat. OMEGA: a peptide or double bond has
+    gone from cis to trans or back. RING: a torsion inside a planar ring beyond 60°. Raises InputError for other atoms.
     """
     positions = np.asarray(positions_nm)
     if positions.ndim == 2:
@@ -165,7 +368,10 @@ def check_frames(positions_nm: npt.ArrayLike, geometry: Geometry) -> npt.NDArray
         for start, columns in column_blocks(positions, widest):
             part = flags[start : start + columns.shape[2]]
             part |= np.uint16(NOT_FINITE) * ~np.isfinite(columns).all(axis=(0, 1))
-            _check_bonds(columns, geometry, part)
+            mean = geometry.bond_mean_nm[:, None]
+            deviation = np.abs(np.sqrt(squared_distance(columns, geometry.bond_idx)) - mean.astype(columns.dtype))
+            part |= np.uint16(BOND_HALF_ANGSTROM) * (deviation > HALF_ANGSTROM_NM).any(axis=0)
+            part |= np.uint16(BOND_20_PERCENT) * (deviation > (0.2 * mean).astype(columns.dtype)).any(axis=0)
             _check_clashes(columns, geometry, part)
             turned = signed_volume(columns, geometry.stereo_idx) * geometry.stereo_sign[:, None] <= 0
             part |= np.uint16(CHIRALITY) * turned.any(axis=0)
@@ -179,14 +385,6 @@ def check_frames(positions_nm: npt.ArrayLike, geometry: Geometry) -> npt.NDArray
 def flag_names(flags: int) -> list[str]:
     """Return what the bits of one frame's flags say, in words."""
     return [name for bit, name in _NAMES.items() if int(flags) & bit]
-
-
-def _check_bonds(columns: FloatArray, geometry: Geometry, part: npt.NDArray[np.uint16]) -> None:
-    length = np.sqrt(squared_distance(columns, geometry.bond_idx))
-    deviation = np.abs(length - geometry.bond_mean_nm[:, None].astype(columns.dtype))
-    part |= np.uint16(BOND_HALF_ANGSTROM) * (deviation > HALF_ANGSTROM_NM).any(axis=0)
-    limit = (0.2 * geometry.bond_mean_nm)[:, None].astype(columns.dtype)
-    part |= np.uint16(BOND_20_PERCENT) * (deviation > limit).any(axis=0)
 
 
 def _check_clashes(columns: FloatArray, geometry: Geometry, part: npt.NDArray[np.uint16]) -> None:
@@ -229,7 +427,7 @@ class Limits(Recorded):
     Angles: `angle_idx (k, 3)` rows (end, middle, end) within `angle_min_rad` and `angle_max_rad (k,)`. Flat centres:
     `flat_idx (k, 4)` rows (centre, a, b, c) no farther than `flat_max_nm (k,)` from the plane of a, b, c. Jumps:
     `jump_idx (k, 2)` pairs of atoms, whose distances change from one frame to the next, `lag_ps` later, by no more than
-    `jump_max_nm`, root mean square, and no less than `jump_min_nm` (0 in files of older versions). The middle of those
+    `jump_max_nm`, root mean square, and no less than `jump_min_nm`. The middle of those
     atoms moves no farther than `jump_max_nm` either: frames stand in one pose, so what it does beyond is drift; or no
     farther than `drift_max_nm`, if that is more, where frames turn about a centre of mass that is elsewhere.
     """
@@ -266,8 +464,10 @@ def limits_from_frames(scene: Scene, positions_nm: npt.ArrayLike, next_nm: npt.A
         raise InputError("None of the reference frames is finite.")
     first, second = first[finite], second[finite]
     near = scene.neighbours()
-    angle_idx = _rows([(a, b, c) for b, around in enumerate(near) for a in around for c in around if a < c], 3)
-    centres = _rows([(i, *around) for i, around in enumerate(near) if len(around) == 3], 4)
+    triples = [(a, b, c) for b, around in enumerate(near) for a in around for c in around if a < c]
+    angle_idx = np.array(triples, dtype=np.int64).reshape(-1, 3)
+    quads = [(i, *around) for i, around in enumerate(near) if len(around) == 3]
+    centres = np.array(quads, dtype=np.int64).reshape(-1, 4)
     angles = np.arccos(np.clip(_gather(first, angle_idx, _angle_cosine), -1.0, 1.0))
     heights = np.abs(_gather(first, centres, _height))
     flat = np.sqrt((heights**2).mean(axis=1)) < _FLAT_NM
@@ -287,8 +487,7 @@ def limits_from_frames(scene: Scene, positions_nm: npt.ArrayLike, next_nm: npt.A
 
 
 def check_limits(positions_nm: npt.ArrayLike, limits: Limits, previous_nm: npt.ArrayLike) -> npt.NDArray[np.uint16]:
-    """Return bits of `systems.chemistry.validity` `(n_frames,)` for frames `(n_frames, n_atoms, 3)` nm; 0 is within the
-    limits.
+    """Return bits `(n_frames,)` for frames `(n_frames, n_atoms, 3)` nm; 0 is within the limits.
 
     ANGLE and PLANARITY: an angle, or a centre's height above the plane of its neighbours, beyond the limits. JUMP and
     DRIFT: too far from the frame before, `previous_nm (n_frames, n_atoms, 3)`; STILL: too near to it, but not equal; a
@@ -314,10 +513,6 @@ def check_limits(positions_nm: npt.ArrayLike, limits: Limits, previous_nm: npt.A
                 far = max(limits.jump_max_nm, limits.drift_max_nm)
                 part |= np.uint16(DRIFT) * ~(np.sqrt((moved * moved).sum(axis=0)) <= far)
     return flags
-
-
-def _rows(rows: list[tuple[int, ...]], width: int) -> IntArray:
-    return np.array(rows, dtype=np.int64).reshape(-1, width)
 
 
 def _jump_pairs(scene: Scene) -> IntArray:

@@ -12,6 +12,7 @@ from typing import (
     Annotated,
     Any,
     Literal,
+    NotRequired,
     Self,
     TypeVar,
     Union,
@@ -97,6 +98,8 @@ def fitted(value: Any, hint: Any, where: str) -> Any:
         return value
     if is_typeddict(hint):
         return _table(value, hint, where)
+    if origin is NotRequired:
+        return fitted(value, args[0], where)
     if origin is Annotated and args[1] is ...:
         return value if isinstance(value, float) else fitted(value, args[0], where)
     if origin is Annotated:
@@ -142,9 +145,10 @@ def fitted(value: Any, hint: Any, where: str) -> Any:
 
 
 def _table(value: Any, hint: Any, where: str) -> dict[str, Any]:
-    if not isinstance(value, dict) or not hint.__required_keys__ <= value.keys():
-        raise ValueError(f"{where} must be a table of {', '.join(hint.__annotations__)}, not {_shown(value)}")
     known = _hints(hint)
+    needed = {key for key in hint.__required_keys__ if get_origin(known[key]) is not NotRequired}
+    if not isinstance(value, dict) or not needed <= value.keys():
+        raise ValueError(f"{where} must be a table of {', '.join(known)}, not {_shown(value)}")
     return {key: fitted(v, known.get(key, Any), f"{where}.{key}") for key, v in value.items()}
 
 

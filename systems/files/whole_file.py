@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import errno
 import hashlib
+import io
 import json
 import os
 import re
@@ -20,7 +21,6 @@ from collections.abc import Callable, Mapping
 from contextlib import suppress
 from functools import cache
 from pathlib import Path
-from types import TracebackType
 from typing import Any
 
 import numpy as np
@@ -83,7 +83,9 @@ def create_whole(path: Path, content: bytes | str | Callable[[Path], object]) ->
                 write_whole(descriptor, content.encode() if isinstance(content, str) else content, 0)
         finally:
             os.close(descriptor)
-        temporary.chmod(0o666 & ~_umask())
+        mask = os.umask(0o077)  # there is no way to ask without setting it
+        os.umask(mask)
+        temporary.chmod(0o666 & ~mask)
         force_out(temporary)
         os.replace(temporary, path)
         force_out(path.parent)
@@ -92,13 +94,6 @@ def create_whole(path: Path, content: bytes | str | Callable[[Path], object]) ->
     finally:
         if temporary is not None:
             temporary.unlink(missing_ok=True)
-
-
-def _umask() -> int:
-    # There is no way to ask without setting it.
-    mask = os.umask(0o077)
-    os.umask(mask)
-    return mask
 
 
 # ---- one writer at a time -------------------------------------------------------------------------------------------
@@ -173,8 +168,7 @@ class OutputLock:
     def __enter__(self) -> OutputLock:
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, value: BaseException | None,
-                 trace: TracebackType | None) -> None:  # fmt: skip
+    def __exit__(self, *_: object) -> None:
         self.close()
 
 
@@ -305,16 +299,16 @@ def journal_path(path: Path) -> Path:
     return path.with_name(path.name + ".journal")
 
 
-class AtomicFile:
+class AtomicFile(io.RawIOBase):
     """A seekable binary file whose writes wait in memory until `commit`, which makes all of them or none.
 
-    HDF5 has no transactions: a process killed, a disk filled or the power lost between two of its writes can leave
-    metadata that name data which never arrived, and then the whole file is lost. Given to h5py as its file object, this
-    class collects the writes of one append. What they overwrite goes to a journal beside the file first, on the medium,
-    then the writes to the file; when these are on the medium, too, the journal is void. A journal that is not void is
-    from a transaction that did not end: who opens the file to write puts the old bytes back, who opens it to read sees
-    them in their place. Other programs read such a file as well after a kill: in-place writes are made in an order in
-    which every prefix is readable (superblock, index nodes from the root down, data and object headers, names last).
+    HDF5 has no transactions: a kill, a full disk or a power failure between two of its writes can leave metadata that
+    name data which never arrived, and then the whole file is lost. Given to h5py as its file object, this class
+    collects the writes of one append. What they overwrite goes to a journal beside the file first, on the medium, then
+    the writes to the file; when these are on the medium, too, the journal is void. One that is not void is from a
+    transaction that did not end: who opens the file to write puts the old bytes back, who opens it to read sees them in
+    their place. Other programs read such a file as well: in-place writes are made in an order in which every prefix is
+    readable (superblock, index nodes from the root down, data and object headers, names last).
 
     `key`: where in the file bytes lie that no other file has, and that no transaction changes; by them a journal knows
     its file. One writer at a time is for the caller to see to. `failure`: why the file could not be read. Raises
@@ -323,6 +317,7 @@ class AtomicFile:
 
     key: tuple[int, int] = (0, 0)
     failure: OSError | None = None
+    _fd = _journal_fd = -1
 
     def __init__(self, path: Path, *, writable: bool) -> None:
         self.path = path
@@ -330,7 +325,6 @@ class AtomicFile:
         self._pending: _Writes = []
         self._position = 0
         self._dead = not writable
-        self._fd = self._journal_fd = -1
         try:
             self._fd = os.open(path, (os.O_RDWR if writable else os.O_RDONLY) | getattr(os, "O_CLOEXEC", 0))
             self._committed_size = self._size = os.fstat(self._fd).st_size
@@ -385,13 +379,9 @@ class AtomicFile:
         self._position = base + offset
         return self._position
 
-    def tell(self) -> int:
-        return self._position
-
-    def read(self, size: int = -1) -> bytes:
+    def readinto(self, buffer: Any) -> int:
         start = self._position
-        stop = self._size if size < 0 else min(start + size, self._size)
-        length = max(stop - start, 0)
+        length = max(min(len(buffer), self._size - start), 0)
         try:
             data = bytearray(os.pread(self._fd, length, start))
         except OSError as error:
@@ -399,18 +389,14 @@ class AtomicFile:
             self.failure, self._dead, data = error, True, bytearray()
         data.extend(bytes(length - len(data)))
         for offset, block in self._pending:
-            low, high = max(offset, start), min(offset + len(block), stop)
+            low, high = max(offset, start), min(offset + len(block), start + length)
             if low < high:
                 data[low - start : high - start] = block[low - offset : high - offset]
         self._position = start + length
-        return bytes(data)
+        buffer[:length] = data
+        return length
 
-    def readinto(self, buffer: bytearray | memoryview) -> int:
-        data = self.read(len(buffer))
-        buffer[: len(data)] = data
-        return len(data)
-
-    def write(self, data: bytes | bytearray | memoryview) -> int:
+    def write(self, data: Any) -> int:
         block = bytes(data)
         if not self._dead:
             self._pending.append((self._position, block))
@@ -483,17 +469,7 @@ class AtomicFile:
         if self._fd >= 0:
             os.close(self._fd)
         self._fd = self._journal_fd = -1
-
-    def __del__(self) -> None:
-        # A reader's is h5py's alone, which does not close what it is given.
-        self.close()
-
-    def __enter__(self) -> AtomicFile:
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, value: BaseException | None,
-                 trace: TracebackType | None) -> None:  # fmt: skip
-        self.close()
+        super().close()
 
 
 def _latest(writes: _Writes) -> _Writes:

@@ -102,10 +102,8 @@ _RESIDUE = "PAR"
 
 
 def harmonic_oscillator() -> Scene:
-    """Return one particle of 12 Da in a harmonic well, a different force constant along each axis.
-
-    At 300 K its spread is 0.22, 0.16 and 0.11 nm, its period 3.1, 2.2 and 1.5 ps.
-    """
+    """Return one particle of 12 Da in a harmonic well, a different force constant along each axis: at 300 K its spread
+    is 0.22, 0.16 and 0.11 nm, its period 3.1, 2.2 and 1.5 ps."""
     law = {"kind": "harmonic", "force_constants_kj_mol_nm2": [50.0, 100.0, 200.0]}
     return _single("harmonic-oscillator", law, [0.1, 0.1, 0.1])
 
@@ -253,13 +251,13 @@ def _entries() -> list[Entry]:
     return found
 
 
-ENTRIES: dict[str, Entry] = {entry.name: entry for entry in _entries()}
+ENTRIES: dict[str, Entry] = {each.name: each for each in _entries()}
 
 
 # ---- scenes by name -------------------------------------------------------------------------------------------------
 
 
-_ON_DEMAND = "Made from their name besides: capped peptides (ACE-ALA-GLY-NME), tetrapeptides in one-letter code (SDFS)."
+ON_DEMAND = "Made from their name besides: capped peptides (ACE-ALA-GLY-NME), tetrapeptides in one-letter code (SDFS)."
 
 
 def names() -> list[str]:
@@ -268,16 +266,11 @@ def names() -> list[str]:
 
 
 def groups() -> dict[str, list[str]]:
-    """Return the names by group, in the catalogue's order; see also `on_demand`."""
+    """Return the names by group, in the catalogue's order; see also `ON_DEMAND`."""
     found: dict[str, list[str]] = {}
-    for entry in ENTRIES.values():
-        found.setdefault(entry.group, []).append(entry.name)
+    for each in ENTRIES.values():
+        found.setdefault(each.group, []).append(each.name)
     return found
-
-
-def on_demand() -> str:
-    """Return one line about the names that are made into scenes when asked for."""
-    return _ON_DEMAND
 
 
 def knows(name: str) -> bool:
@@ -285,30 +278,15 @@ def knows(name: str) -> bool:
     return _find(name) is not None
 
 
-def describe(name: str) -> str:
-    """Return one line about a named scene. Raises UnknownNameError."""
-    return _known(name).title
-
-
-def own_settings(name: str) -> dict[str, Any]:
-    """Return the settings that a model system brings (names of `api.reference`); empty for a molecule.
-
-    Raises UnknownNameError.
-    """
-    return dict(_known(name).own_settings)
-
-
-def source_of_settings(name: str) -> str:
-    """Return where a model system's own settings come from, in words. Raises UnknownNameError."""
-    return _known(name).source
-
-
-def protocols(name: str) -> tuple[str, ...]:
-    """Return the names of the protocols (systems.library.named_scenes) that papers simulated this scene by.
-
-    Raises UnknownNameError.
-    """
-    return _known(name).protocols
+def entry(name: str) -> Entry:
+    """Return what the library says of a scene, shipped or on demand. Raises UnknownNameError, with the nearest."""
+    found = _find(name)
+    if found is None:
+        raise UnknownNameError(
+            f"No system is called {name!r}.{nearest(name, names())} `surromd systems` lists them; a file is named by "
+            "its path, a peptide as sequence:..., a molecule as smiles:..."
+        )
+    return found
 
 
 def load(name: str) -> Scene:
@@ -316,25 +294,24 @@ def load(name: str) -> Scene:
 
     Raises UnknownNameError, and PreparationError for a peptide that cannot be built.
     """
-    scene = _load(_known(name))
-    return replace(scene, provenance=dict(scene.provenance))
+    found = entry(name)
+    provenance: dict[str, Any] = {"source": "library", "library_name": found.name, "repairs": []}
+    if found.group == ANALYTIC:
+        return {"harmonic-oscillator": harmonic_oscillator, "double-well": double_well}[found.name]()
+    if found.name in ENTRIES:
+        return replace(_shipped(found.file or found.name), name=found.name, provenance=provenance)
+    scene = _built_peptide(found.sequence)
+    return replace(scene, name=found.name, provenance=provenance | scene.provenance | {"source": "library"})
 
 
 @cache
 def _shipped(file: str) -> Scene:
-    from systems.prepare.structure import scene_from_file
+    from systems.prepare.records import scene_from_records
+    from systems.prepare.structure_text import read_structure
 
-    path = Path(str(files("systems.library") / "data" / f"{file}.pdb"))
-    return scene_from_file(path, name=file, provenance={})
-
-
-def _load(entry: Entry) -> Scene:
-    provenance = {"source": "library", "library_name": entry.name, "repairs": []}
-    if entry.group == ANALYTIC:
-        return {"harmonic-oscillator": harmonic_oscillator, "double-well": double_well}[entry.name]()
-    if entry.name in ENTRIES:
-        return replace(_shipped(entry.file or entry.name), name=entry.name, provenance=provenance)
-    return _built(entry)
+    # Its CONECT records hold every bond.
+    found = read_structure(Path(str(files("systems.library") / "data" / f"{file}.pdb")))
+    return scene_from_records(found.atoms, np.array(found.conect, dtype=np.int64), name=file, provenance={})
 
 
 @cache
@@ -342,22 +319,6 @@ def _built_peptide(sequence: str) -> Scene:
     from systems.prepare.peptide import build_peptide
 
     return build_peptide(sequence)
-
-
-def _built(entry: Entry) -> Scene:
-    scene = _built_peptide(entry.sequence)
-    provenance = scene.provenance | {"source": "library", "library_name": entry.name}
-    return replace(scene, name=entry.name, provenance=provenance)
-
-
-def _known(name: str) -> Entry:
-    entry = _find(name)
-    if entry is None:
-        raise UnknownNameError(
-            f"No system is called {name!r}.{nearest(name, names())} `surromd systems` lists them; a file is named by "
-            "its path, a peptide as sequence:..., a molecule as smiles:..."
-        )
-    return entry
 
 
 def _find(name: str) -> Entry | None:
@@ -410,9 +371,9 @@ def prepare(spec: str, options: Preparation) -> Scene:
     with the caps NME and ACE.
     Raises UnknownNameError, InputError or PreparationError, each in one line.
     """
-    from systems.prepare.read.mol2_file import is_peptide_mol2
-    from systems.prepare.read.mol_file import SUFFIXES
-    from systems.prepare.read.records import suffix_of
+    from systems.prepare.mol2_file import is_peptide_mol2
+    from systems.prepare.molecule import SUFFIXES
+    from systems.prepare.records import suffix_of
     from systems.prepare.structure_file import prepare_file
 
     options.refuse_contradictions()

@@ -9,19 +9,18 @@ from itertools import pairwise, product
 
 import networkx as nx
 import numpy as np
-import numpy.typing as npt
 
-from systems.chemistry.cell import bonded_images, images_of_whole
-from systems.chemistry.geometry import near_pairs, signed_volumes
+from systems.chemistry.distance_bonds import bonded_images, images_of_whole
+from systems.chemistry.geometry import extend, near_pairs, signed_volumes
 from systems.errors import PreparationError, listed
 from systems.prepare.bonding import links_residues
-from systems.prepare.read.records import AtomRecord, Bonding, Residue, StructureFile
-from systems.prepare.structure import atom_label
+from systems.prepare.records import AtomRecord, Bonding, Residue, ResidueKey, StructureFile, distance_angstrom
+from systems.scene import FloatArray, IntArray, neighbours_of
 
-Vector = npt.NDArray[np.float64]
 # Lengths in Å and angles in degrees of Engh and Huber, Acta Cryst. A47, 392 (1991).
 _C_N, _C_O, _C_CH3, _N_CH3 = 1.335, 1.231, 1.52, 1.45
 _C_N_CA, _CH3_C_N, _O_C_N = 121.7, 116.2, 123.0
+_NH_ANGSTROM = 1.3
 _PHI = (-65.0, -85.0, -110.0, -135.0, -160.0, 180.0, 60.0, 90.0, 120.0, 150.0)
 
 
@@ -63,7 +62,7 @@ def caps_of(gaps: Sequence[tuple[Residue, Residue]], atoms: Sequence[AtomRecord]
                 raise PreparationError(f"{end.label} lacks {' '.join(lacking)}, from which its cap would be built.")
         ca, c, o = (_at(atoms, before, a) for a in ("CA", "C", "O"))
         n = c + _C_N * _between(c, ca, o)
-        caps += _records("NME", _beside(before, 1), {"N": n, "C": _placed(ca, c, n, _N_CH3, _C_N_CA, 180.0)})
+        caps += _records("NME", _beside(before, 1), {"N": n, "C": extend(ca, c, n, _N_CH3, _C_N_CA, 180.0)})
         others = np.array([a.position_angstrom for a in (*atoms, *caps) if a.element != "H"])
         acetyls = _acetyls(atoms, residue)
         n = _at(atoms, residue, "N")
@@ -78,32 +77,33 @@ def caps_of(gaps: Sequence[tuple[Residue, Residue]], atoms: Sequence[AtomRecord]
     return caps
 
 
-def _acetyls(atoms: Sequence[AtomRecord], residue: Residue) -> list[dict[str, Vector]]:
+def _acetyls(atoms: Sequence[AtomRecord], residue: Residue) -> list[dict[str, FloatArray]]:
     """Possible ACE before a residue: the one that its nitrogen's other atoms leave, else one for each φ."""
     n, ca, c = (_at(atoms, residue, a) for a in ("N", "CA", "C"))
-    third = [i for i in residue.atoms if atoms[i].element == "H" and np.linalg.norm(_position(atoms[i]) - n) < 1.3]
+    nitrogen = atoms[residue.heavy["N"]]
+    third = [
+        atoms[i]
+        for i in residue.atoms
+        if atoms[i].element == "H" and distance_angstrom(atoms[i], nitrogen) < _NH_ANGSTROM
+    ]
     if "CD" in residue.heavy and residue.template is not None and residue.template.name == "PRO":
-        third = [residue.heavy["CD"]]
+        third = [atoms[residue.heavy["CD"]]]
     if len(third) == 1:
-        carbons = [n + _C_N * _between(n, ca, _position(atoms[third[0]]))]
+        carbons = [n + _C_N * _between(n, ca, np.array(third[0].position_angstrom))]
     else:
-        carbons = [_placed(c, ca, n, _C_N, _C_N_CA, phi) for phi in _PHI]
+        carbons = [extend(c, ca, n, _C_N, _C_N_CA, phi) for phi in _PHI]
     return [
         {
             "C": carbon,
-            "O": _placed(ca, n, carbon, _C_O, _O_C_N, 0.0),
-            "CH3": _placed(ca, n, carbon, _C_CH3, _CH3_C_N, 180.0),
+            "O": extend(ca, n, carbon, _C_O, _O_C_N, 0.0),
+            "CH3": extend(ca, n, carbon, _C_CH3, _CH3_C_N, 180.0),
         }
         for carbon in carbons
     ]
 
 
-def _records(name: str, place: tuple[str, str], positions: dict[str, Vector]) -> list[AtomRecord]:
-    chain, number = place
-    return [
-        AtomRecord("", atom, "", name, chain, number, (float(x), float(y), float(z)), 1.0, atom[0], False)
-        for atom, (x, y, z) in positions.items()
-    ]
+def _records(name: str, place: tuple[str, str], positions: dict[str, FloatArray]) -> list[AtomRecord]:
+    return [AtomRecord(atom, atom[0], name, *place, tuple(at.tolist())) for atom, at in positions.items()]
 
 
 def _beside(residue: Residue, step: int) -> tuple[str, str]:
@@ -113,31 +113,15 @@ def _beside(residue: Residue, step: int) -> tuple[str, str]:
     return chain, str(int(digits[0]) + step) if digits else number
 
 
-def _position(atom: AtomRecord) -> Vector:
-    return np.array(atom.position_angstrom, dtype=np.float64)
+def _at(atoms: Sequence[AtomRecord], residue: Residue, name: str) -> FloatArray:
+    return np.array(atoms[residue.heavy[name]].position_angstrom)
 
 
-def _at(atoms: Sequence[AtomRecord], residue: Residue, name: str) -> Vector:
-    return _position(atoms[residue.heavy[name]])
-
-
-def _between(centre: Vector, first: Vector, second: Vector) -> Vector:
+def _between(centre: FloatArray, first: FloatArray, second: FloatArray) -> FloatArray:
     """The third direction of a planar centre with two neighbours, a unit vector."""
     a, b = centre - first, centre - second
-    away: Vector = a / np.linalg.norm(a) + b / np.linalg.norm(b)
+    away: FloatArray = a / np.linalg.norm(a) + b / np.linalg.norm(b)
     return away / np.linalg.norm(away)
-
-
-def _placed(a: Vector, b: Vector, c: Vector, length: float, angle_deg: float, torsion_deg: float) -> Vector:
-    """The point at `length` from c, at an angle b-c-x and a torsion a-b-c-x (natural extension reference frame)."""
-    angle, torsion = np.radians(angle_deg), np.radians(torsion_deg)
-    along = (c - b) / np.linalg.norm(c - b)
-    normal = np.cross(b - a, along)
-    normal /= np.linalg.norm(normal)
-    side = np.cross(normal, along)
-    x = np.cos(torsion) * np.sin(angle) * side + np.sin(torsion) * np.sin(angle) * normal - np.cos(angle) * along
-    point: Vector = c + length * x
-    return point
 
 
 # ---- handedness of amino acids: L or D, and whether preparation left it as it was -----------------------------------
@@ -148,7 +132,6 @@ _ALPHA = ("CA", "N", "C", "CB")
 _BETA = {"THR": ("CB", "CA", "OG1", "CG2"), "ILE": ("CB", "CA", "CG1", "CG2")}
 _FLAT_NM3 = 2e-4
 
-ResidueKey = tuple[str, str, str]
 Handedness = dict[tuple[ResidueKey, str], int]
 
 
@@ -160,11 +143,10 @@ def handedness(residues: Iterable[tuple[ResidueKey, str, Mapping[str, AtomRecord
     found: Handedness = {}
     for key, name, heavy in residues:
         for row in (_ALPHA, _BETA[name]) if name in _BETA else (_ALPHA,):
-            if not set(row) <= set(heavy):
-                continue
-            at = np.array([heavy[a].position_angstrom for a in row]) / 10.0
-            volume = float(signed_volumes(at, [[0, 1, 2, 3]])[0])
-            found[key, row[0]] = 0 if abs(volume) < _FLAT_NM3 else (1 if volume > 0 else -1)
+            if set(row) <= set(heavy):
+                at = np.array([heavy[a].position_angstrom for a in row]) / 10.0
+                volume = float(signed_volumes(at, [[0, 1, 2, 3]])[0])
+                found[key, row[0]] = 0 if abs(volume) < _FLAT_NM3 else (1 if volume > 0 else -1)
     return found
 
 
@@ -190,24 +172,11 @@ def say_inverted(found: Handedness, notes: list[str]) -> None:
         notes.append(f"flat stereocentres, as the file has them: {listed(flat)}")
 
 
-def heavy_of_records(records: Sequence[AtomRecord]) -> dict[ResidueKey, dict[str, AtomRecord]]:
-    """Heavy atoms by residue and name, for records under standard names."""
-    out: dict[ResidueKey, dict[str, AtomRecord]] = {}
-    for atom in records:
-        if atom.element != "H":
-            out.setdefault(atom.residue_key, {})[atom.name] = atom
-    return out
-
-
 def _label(key: ResidueKey) -> str:
     return f"{key[2]} {key[0]}{key[1]}"
 
 
 # ---- molecules made whole by cell vectors ---------------------------------------------------------------------------
-
-
-FloatArray = npt.NDArray[np.float64]
-IntArray = npt.NDArray[np.int64]
 
 
 def made_whole(found: StructureFile) -> StructureFile:
@@ -282,19 +251,16 @@ _COINCIDE_ANGSTROM = 0.1
 _CLOSE_ANGSTROM = (1.5, 1.1, 0.9)
 
 
-def check_contacts(atoms: Sequence[AtomRecord], bonds: npt.NDArray[np.int64]) -> list[str]:
+def check_contacts(atoms: Sequence[AtomRecord], bonds: IntArray) -> list[str]:
     """Return a note of atoms that are close, with more than three bonds between them; none where all keep apart.
 
     Raises PreparationError for atoms that have the same place.
     """
-    neighbours: dict[int, set[int]] = {}
-    for i, j in bonds.tolist():
-        neighbours.setdefault(i, set()).add(j)
-        neighbours.setdefault(j, set()).add(i)
+    neighbours = neighbours_of(bonds, len(atoms))
     x = np.array([a.position_angstrom for a in atoms])
     found = []
     for i, j in near_pairs(x, max(_CLOSE_ANGSTROM), "the structure").tolist():
-        gap = float(np.linalg.norm(x[i] - x[j]))
+        gap = distance_angstrom(atoms[i], atoms[j])
         kind = sum(atoms[k].element == "H" for k in (i, j))
         if gap < _CLOSE_ANGSTROM[kind] and not _is_near(neighbours, i, j):
             found.append((gap, i, j))
@@ -302,14 +268,14 @@ def check_contacts(atoms: Sequence[AtomRecord], bonds: npt.NDArray[np.int64]) ->
         return []
     gap, i, j = min(found)
     more = f", and {len(found) - 1} pairs more are close" if len(found) > 1 else ""
-    what = f"{atom_label(atoms[i])} and {atom_label(atoms[j])} are {gap:.2f} Å apart and not bonded{more}"
+    what = f"{atoms[i].label} and {atoms[j].label} are {gap:.2f} Å apart and not bonded{more}"
     if gap < _COINCIDE_ANGSTROM:
         raise PreparationError(f"{what}: atoms have the same place; take one of them out, or model them again.")
     return [f"{what}; minimising has to part them"]
 
 
-def _is_near(neighbours: dict[int, set[int]], i: int, j: int, n_bonds: int = 3) -> bool:
+def _is_near(neighbours: list[list[int]], i: int, j: int) -> bool:
     reached = {i}
-    for _ in range(n_bonds):
-        reached |= {b for a in reached for b in neighbours.get(a, ())}
+    for _ in range(3):
+        reached |= {b for a in reached for b in neighbours[a]}
     return j in reached

@@ -10,14 +10,12 @@ from itertools import groupby
 
 import networkx as nx
 import numpy as np
-import numpy.typing as npt
 
 from systems.chemistry.residues import is_water_name, template_for
 from systems.errors import PreparationError, listed
 from systems.prepare.bonding import are_ions
-from systems.prepare.read.records import AtomRecord, Bonding
-
-FloatArray = npt.NDArray[np.float64]
+from systems.prepare.records import AtomRecord, Bonding, ResidueKey, by_residue
+from systems.scene import FloatArray, IntArray
 
 WATER_BOND_ANGSTROM = 1.3
 _OH_ANGSTROM = 0.9572
@@ -28,7 +26,7 @@ _DIRECTIONS = 64
 
 def complete_waters(
     waters: Sequence[AtomRecord], others: Sequence[AtomRecord], notes: list[str]
-) -> tuple[list[AtomRecord], npt.NDArray[np.int64]]:
+) -> tuple[list[AtomRecord], IntArray]:
     """Return the waters as oxygen and two hydrogens each, in the file's order, and their bonds `(n_bonds, 2)`.
 
     A hydrogen belongs to the nearest oxygen, within 1.3 Å. Oxygens without their two are given new ones, turned away
@@ -76,9 +74,7 @@ def _freest(oxygen: FloatArray, near: FloatArray, rng: np.random.Generator) -> F
     side = np.stack([across, -across], axis=1) * np.sin(_HALF_HOH)
     pairs: FloatArray = oxygen + _OH_ANGSTROM * (along[:, None] * np.cos(_HALF_HOH) + side)
     others = near[np.linalg.norm(near - oxygen, axis=1) > _OH_ANGSTROM / 2]
-    if not len(others):
-        return pairs[0]
-    gaps = np.linalg.norm(pairs[:, :, None] - others[None, None], axis=3).min(axis=(1, 2))
+    gaps = np.linalg.norm(pairs[:, :, None] - others[None, None], axis=3).min(axis=(1, 2), initial=np.inf)
     return pairs[int(gaps.argmax())]
 
 
@@ -110,23 +106,19 @@ def is_water(atoms: Sequence[AtomRecord]) -> bool:
     if len(oxygens) + len(hydrogens) < len(atoms):
         return False
     if is_water_name(atoms[0].residue_name):
-        return not oxygens or (len(hydrogens) <= 2 * len(oxygens) and _are_apart(oxygens))
+        if len(oxygens) < 2 or len(hydrogens) > 2 * len(oxygens):  # of a box of water, each has one
+            return not oxygens or len(hydrogens) <= 2
+        from scipy.spatial import cKDTree
+
+        return not cKDTree(oxygens).query_pairs(_PEROXIDE_ANGSTROM)
     if len(hydrogens) < 2 * len(oxygens) or not oxygens:
         return False
-    if len(oxygens) == 1:  # of a box of water, each
+    if len(oxygens) == 1:
         return len(hydrogens) == 2 and all(math.dist(oxygens[0], h) < WATER_BOND_ANGSTROM for h in hydrogens)
     from scipy.spatial import cKDTree
 
     gaps, owners = cKDTree(oxygens).query(hydrogens)
     return bool((gaps < WATER_BOND_ANGSTROM).all()) and bool((np.bincount(owners, minlength=len(oxygens)) == 2).all())
-
-
-def _are_apart(oxygens: Sequence[tuple[float, float, float]]) -> bool:
-    if len(oxygens) == 1:  # of a box of water, each
-        return True
-    from scipy.spatial import cKDTree
-
-    return not cKDTree(oxygens).query_pairs(_PEROXIDE_ANGSTROM)
 
 
 def resolve_solvent(
@@ -139,7 +131,7 @@ def resolve_solvent(
     """
     runs = [list(run) for _, run in groupby(kept, key=lambda i: atoms[i].residue_key)]
     runs = [run for run in runs if not is_water_name(atoms[run[0]].residue_name)]
-    named: dict[tuple[str, str, str], list[int]] = {}  # all oxygens may stand before all hydrogens
+    named: dict[ResidueKey, list[int]] = {}  # all oxygens may stand before all hydrogens
     for i in kept:
         if is_water_name(atoms[i].residue_name):
             named.setdefault(atoms[i].residue_key, []).append(i)
@@ -172,7 +164,7 @@ def _free(atoms: Sequence[AtomRecord], ions: Sequence[int], solute: Sequence[int
     from scipy.spatial import cKDTree
 
     gap, _ = cKDTree(np.array(donors)).query(np.array([atoms[i].position_angstrom for i in ions]))
-    return {i for i, d in zip(ions, np.atleast_1d(gap).tolist(), strict=True) if d > _BOUND_ANGSTROM}
+    return {i for i, d in zip(ions, gap.tolist(), strict=True) if d > _BOUND_ANGSTROM}
 
 
 def ligand_atoms(atoms: Sequence[AtomRecord], bonding: Bonding) -> list[int]:
@@ -197,8 +189,8 @@ def agent_atoms(atoms: Sequence[AtomRecord], ligands: Sequence[int], notes: list
     """Indices of those ligands that are agents of crystallisation, buffers and counter-ions, by name and by elements;
     `notes` says which are left out."""
     found, names = [], []
-    for _, run in groupby(sorted(ligands, key=lambda i: atoms[i].residue_key), key=lambda i: atoms[i].residue_key):
-        members = list(run)
+    for _, run in sorted(by_residue([atoms[i] for i in ligands]).items()):
+        members = [ligands[k] for k in run]
         count = Counter(atoms[i].element for i in members if atoms[i].element != "H")
         heavy = "".join(f"{e}{n if n > 1 else ''}" for e, n in sorted(count.items()))
         if _AGENTS.get(atoms[members[0]].residue_name.upper()) == heavy:
@@ -232,10 +224,8 @@ def resolve_ligands(
 
 def refuse_bare_ligands(atoms: Sequence[AtomRecord], ligands: Sequence[int]) -> None:
     """A ligand with carbon and no hydrogen is one whose hydrogens the file leaves out. Raises PreparationError."""
-    by_residue: dict[tuple[str, str, str], set[str]] = {}
-    for i in ligands:
-        by_residue.setdefault(atoms[i].residue_key, set()).add(atoms[i].element)
-    for (chain, number, name), elements in by_residue.items():
+    for (chain, number, name), members in by_residue([atoms[i] for i in ligands]).items():
+        elements = {atoms[ligands[k]].element for k in members}
         if ("C" in elements and "H" not in elements) or (elements == {"O"} and template_for(name) is None):
             raise PreparationError(
                 f"{name} {chain}{number} has no hydrogens, which a ligand must bring; add them (its SDF from the "

@@ -6,17 +6,13 @@ from itertools import pairwise
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from systems.chemistry.geometry import extend, signed_volumes, superposition, torsion
 from systems.chemistry.residues import ONE_LETTER, amino_acid_names, template_for
 from systems.errors import PreparationError, nearest
-from systems.prepare.protonation import protonation_summary
-from systems.prepare.read.records import D_RESIDUES
-from systems.prepare.repair import fixed_random_numbers, records_from_openmm
-from systems.prepare.rotamers import residue_shape
-from systems.prepare.structure import scene_from_records
-from systems.scene import Scene
+from systems.prepare.records import D_RESIDUES, scene_from_records
+from systems.prepare.repair import fixed_random_numbers, protonation_summary, records_from_openmm, residue_shape
+from systems.scene import FloatArray, Scene
 
 _PROTONATED = {"HID": "HIS", "HIE": "HIS", "HIP": "HIS", "ASH": "ASP", "GLH": "GLU", "LYN": "LYS"}
 _PHI_DEG, _PSI_DEG, _PROLINE_PHI_DEG = -140.0, 140.0, -70.0
@@ -24,8 +20,6 @@ _LONGEST = 200
 # Lengths in nm and angles in degrees: Engh and Huber, Acta Cryst. A47, 392 (1991).
 _N_CA, _CA_C, _C_N, _C_O = 0.1458, 0.1525, 0.1329, 0.1231
 _N_CA_C, _CA_C_N, _C_N_CA, _CA_C_O = 111.2, 116.2, 121.7, 120.8
-
-Vector = npt.NDArray[np.float64]
 
 
 def parse_sequence(text: str) -> list[str]:
@@ -110,14 +104,14 @@ def build_peptide(text: str, *, ph: float = 7.0) -> Scene:
     return scene
 
 
-def _heavy_atoms(names: list[str]) -> tuple[Any, Vector]:
+def _heavy_atoms(names: list[str]) -> tuple[Any, FloatArray]:
     from openmm import app
 
     topology = app.Topology()
     chain = topology.addChain("A")
-    positions: list[Vector] = []
+    positions: list[FloatArray] = []
     previous: dict[str, Any] = {}
-    at: dict[str, Vector] = {}
+    at: dict[str, FloatArray] = {}
     psi = _PSI_DEG
     for k, name in enumerate(names):
         template = template_for(name)
@@ -140,7 +134,7 @@ def _heavy_atoms(names: list[str]) -> tuple[Any, Vector]:
     return topology, np.array(positions)
 
 
-def _place(name: str, before: dict[str, Vector], phi: float, psi: float) -> dict[str, Vector]:
+def _place(name: str, before: dict[str, FloatArray], phi: float, psi: float) -> dict[str, FloatArray]:
     """Heavy atoms of one residue, joined to the one before by a trans peptide bond."""
     if name == "ACE":
         at = {"CH3": np.zeros(3), "C": np.array([_CA_C, 0.0, 0.0])}
@@ -168,7 +162,7 @@ def _place(name: str, before: dict[str, Vector], phi: float, psi: float) -> dict
     return at | side
 
 
-def _relaxed(modeller: Any) -> Vector:
+def _relaxed(modeller: Any) -> FloatArray:
     """Minimise in ff14SB without charges: in vacuum these pull charged groups together and twist peptide bonds."""
     from openmm import Context, LocalEnergyMinimizer, NonbondedForce, Platform, VerletIntegrator, app, unit
 

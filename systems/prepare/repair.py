@@ -1,25 +1,31 @@
-"""Missing heavy atoms and hydrogens of standard residues, added by PDBFixer and OpenMM."""
+"""Missing heavy atoms and hydrogens of residues that are known by name, added by PDBFixer and OpenMM, in the
+protonation that the file shows or the pH decides, with side chains turned out of other atoms.
+"""
 
 from __future__ import annotations
 
 import contextlib
 import io
 import random
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
-from itertools import permutations
+from functools import lru_cache
+from importlib.resources import files
+from itertools import permutations, product
+from pathlib import Path
 from typing import Any
 
+import networkx as nx
 import numpy as np
-import numpy.typing as npt
 
 from systems.chemistry.element_data import covalent_radius_nm
-from systems.chemistry.residues import template_for
+from systems.chemistry.geometry import extend, torsion
+from systems.chemistry.residues import component, hydrogens_of, template_for
 from systems.errors import PreparationError, first_line, listed
-from systems.prepare.protonation import TITRATED, asked_hydrogens, protonation_summary
-from systems.prepare.read.records import AtomRecord, Bonding, Residue
-from systems.prepare.rotamers import resolve_side_chains
-from systems.prepare.structure import atom_label
+from systems.prepare.bonding import links_of
+from systems.prepare.records import AtomRecord, Bonding, Residue, ResidueKey, distance_angstrom
+from systems.prepare.structure_text import pdb_atom, read_structure
+from systems.scene import FloatArray, IntArray, neighbours_of
 
 _C_OXT_ANGSTROM = 1.25
 _HYDROGEN_ANGSTROM = {"C": 1.09, "N": 1.01, "O": 0.96, "S": 1.34}
@@ -29,7 +35,7 @@ _CHAIN_LETTERS = "ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz0123456789
 
 def complete(
     atoms: Sequence[AtomRecord], bonding: Bonding, *, ph: float
-) -> tuple[list[AtomRecord], npt.NDArray[np.int64], list[str]]:
+) -> tuple[list[AtomRecord], IntArray, list[str]]:
     """Return atoms, bonds and a summary of what was added to structures of residues that are all known by name.
 
     Heavy atoms of the file keep their positions; hydrogens of residues that had all of theirs keep them too, the others
@@ -89,7 +95,7 @@ def _forget_linked(fixer: Any, residues: Sequence[Residue]) -> None:
             fixer.missingAtoms[built] = [a for a in fixer.missingAtoms[built] if a.name in residue.missing]
 
 
-def _add_bonds(topology: Any, residues: Sequence[Residue], bonds: npt.NDArray[np.int64]) -> None:
+def _add_bonds(topology: Any, residues: Sequence[Residue], bonds: IntArray) -> None:
     """Add the bonds of heavy atoms that OpenMM does not know by the names of residues."""
     built = [{a.name: a for a in residue.atoms()} for residue in topology.residues()]
     place = {i: at[name] for r, at in zip(residues, built, strict=True) for name, i in r.heavy.items() if name in at}
@@ -125,26 +131,15 @@ def _without_overlaps(fixer: Any, residues: Sequence[Residue]) -> list[str]:
 
 
 def records_from_openmm(
-    topology: Any, positions_nm: npt.NDArray[np.float64], keys: Sequence[tuple[str, str, str]]
-) -> tuple[list[AtomRecord], npt.NDArray[np.int64]]:
+    topology: Any, positions_nm: FloatArray, keys: Sequence[ResidueKey]
+) -> tuple[list[AtomRecord], IntArray]:
     """Return records and bonds of an OpenMM topology whose residues are `keys` (chain, number, name), in that order."""
     records = []
     for residue, (chain, number, name) in zip(topology.residues(), keys, strict=True):
         for atom in residue.atoms():
             x, y, z = (positions_nm[atom.index] * 10.0).tolist()
             records.append(
-                AtomRecord(
-                    serial=str(atom.index + 1),
-                    name=atom.name,
-                    altloc="",
-                    residue_name=name,
-                    chain=chain,
-                    residue_id=number,
-                    position_angstrom=(x, y, z),
-                    occupancy=1.0,
-                    element=atom.element.symbol,
-                    hetero=False,
-                )
+                AtomRecord(atom.name, atom.element.symbol, name, chain, number, (x, y, z), str(atom.index + 1))
             )
     bonds = {(min(a.index, b.index), max(a.index, b.index)) for a, b in topology.bonds()}
     return records, np.array(sorted(bonds), dtype=np.int64).reshape(-1, 2)
@@ -199,28 +194,18 @@ def _heavy_atom_text(atoms: Sequence[AtomRecord], chains: Sequence[Sequence[Resi
         letter = _CHAIN_LETTERS[k % len(_CHAIN_LETTERS)]
         for residue in chain:
             number += 1
+            # A component goes by a name that OpenMM knows nothing about, and therefore leaves alone.
+            standard = template_for(residue.key[2])
+            place = (_UNKNOWN if standard is None else standard.name, letter, str(number % 10000))
             name_of = {i: a for a, i in residue.heavy.items()}
-            residue_name = _name_for_openmm(residue)
-            for i in residue.atoms:
-                atom = atoms[i]
-                if atom.element == "H":
-                    continue
-                name = name_of.get(i, atom.name)
-                padded = name[:4] if len(name) >= 4 or len(atom.element) == 2 else f" {name}"
-                head = f"ATOM  {len(lines) % 100000:5d} {padded:<4s} {residue_name[:3]:>3s} {letter}{number % 10000:4d}"
-                x, y, z = atom.position_angstrom
-                lines.append(f"{head}    {x:8.3f}{y:8.3f}{z:8.3f}  1.00  0.00          {atom.element.upper():>2s}")
-            for name, (x, y, z) in _built(residue, atoms).items():
-                head = f"ATOM  {len(lines) % 100000:5d}  {name:<3s} {residue_name[:3]:>3s} {letter}{number % 10000:4d}"
-                lines.append(f"{head}    {x:8.3f}{y:8.3f}{z:8.3f}  1.00  0.00           {name[0]}")
+            heavy = [(name_of.get(i, atoms[i].name), atoms[i].element.upper(), atoms[i].position_angstrom)
+                     for i in residue.atoms if atoms[i].element != "H"]  # fmt: skip
+            heavy += [(name, name[0], (x, y, z)) for name, (x, y, z) in _built(residue, atoms).items()]
+            lines += [
+                pdb_atom(len(lines) + n, name, element, *place, at) for n, (name, element, at) in enumerate(heavy)
+            ]
         lines.append("TER")
     return "\n".join([*lines, "END", ""])
-
-
-def _name_for_openmm(residue: Residue) -> str:
-    """The standard name; for a component one that OpenMM knows nothing about, and therefore leaves alone."""
-    standard = template_for(residue.key[2])
-    return _UNKNOWN if standard is None else standard.name
 
 
 def _built(residue: Residue, atoms: Sequence[AtomRecord]) -> dict[str, list[float]]:
@@ -242,17 +227,14 @@ def _built(residue: Residue, atoms: Sequence[AtomRecord]) -> dict[str, list[floa
 
 
 def _with_usual_lengths(
-    records: list[AtomRecord], bonds: npt.NDArray[np.int64], kept: set[tuple[tuple[str, str, str], str]]
+    records: list[AtomRecord], bonds: IntArray, kept: set[tuple[ResidueKey, str]]
 ) -> list[AtomRecord]:
     """Put each added hydrogen at the usual distance from its atom (Modeller leaves some 10 % too much), and on a carbon
     with two other neighbours into their plane (beside residues that it does not know Modeller may not find it); refuse
     heavy atoms that were put nowhere near theirs. `kept`: residue and name of the atoms that the file had.
     """
     out = list(records)
-    neighbours: dict[int, list[int]] = {}
-    for a, b in bonds.tolist():
-        neighbours.setdefault(a, []).append(b)
-        neighbours.setdefault(b, []).append(a)
+    neighbours = neighbours_of(bonds, len(records))
     for i, j in bonds.tolist():
         if records[i].element == "H":
             i, j = j, i
@@ -273,7 +255,7 @@ def _with_usual_lengths(
         expected = 10.0 * (covalent_radius_nm(records[i].element) + covalent_radius_nm(records[j].element))
         if not 0.75 * expected < length < 1.25 * expected:
             raise PreparationError(
-                f"{atom_label(records[i])} and {atom_label(records[j])} came out {length:.2f} Å apart when missing "
+                f"{records[i].label} and {records[j].label} came out {length:.2f} Å apart when missing "
                 "atoms were added; give the residue with all its heavy atoms."
             )
     return out
@@ -281,7 +263,7 @@ def _with_usual_lengths(
 
 def _refuse_lost_bonds(
     records: Sequence[AtomRecord],
-    bonds: npt.NDArray[np.int64],
+    bonds: IntArray,
     atoms: Sequence[AtomRecord],
     bonding: Bonding,
 ) -> None:
@@ -291,34 +273,30 @@ def _refuse_lost_bonds(
     for i, j in bonding.bonds.tolist():
         if i in name_of and j in name_of and frozenset((name_of[i], name_of[j])) not in made:
             raise PreparationError(
-                f"atoms are missing, and the bond {atom_label(atoms[i])} - {atom_label(atoms[j])} would be lost in "
+                f"atoms are missing, and the bond {atoms[i].label} - {atoms[j].label} would be lost in "
                 "adding them; give the structure with all hydrogens."
             )
 
 
 def _keep_hydrogens(
-    records: list[AtomRecord], bonds: npt.NDArray[np.int64], atoms: Sequence[AtomRecord], bonding: Bonding
+    records: list[AtomRecord], bonds: IntArray, atoms: Sequence[AtomRecord], bonding: Bonding
 ) -> list[AtomRecord]:
     """Put the file's hydrogens back where a heavy atom has as many as before."""
     whole = {r.key: r for r in bonding.residues if r.heavy and not r.lacks_hydrogens}
-    old_at: dict[int, list[int]] = {}
-    for i, j in bonding.bonds.tolist():
-        for a, b in ((i, j), (j, i)):
-            if atoms[b].element == "H":
-                old_at.setdefault(a, []).append(b)
-    new_at: dict[int, list[int]] = {}
-    for i, j in bonds.tolist():
-        for a, b in ((i, j), (j, i)):
-            if records[b].element == "H":
-                new_at.setdefault(a, []).append(b)
+    before, after = bonding.neighbours, neighbours_of(bonds, len(records))
     out = list(records)
-    for parent, new in new_at.items():
+    for parent, around in enumerate(after):
         residue = whole.get(records[parent].residue_key)
-        old = old_at.get(residue.heavy.get(records[parent].name, -1), []) if residue is not None else []
-        if len(old) != len(new):
+        kept = None if residue is None else residue.heavy.get(records[parent].name)
+        new = [j for j in around if records[j].element == "H"]
+        old = [] if kept is None else [j for j in before[kept] if atoms[j].element == "H"]
+        if not new or len(old) != len(new):
             continue
-        chosen = min(permutations(old), key=lambda p: _distance(p, new, atoms, records))
-        for a, b in zip(new, chosen, strict=True):
+
+        def moved(chosen: Iterable[int], new: list[int] = new) -> float:
+            return sum(distance_angstrom(atoms[i], records[j]) ** 2 for i, j in zip(chosen, new, strict=True))
+
+        for a, b in zip(new, min(permutations(old), key=moved), strict=True):
             out[a] = replace(records[a], position_angstrom=atoms[b].position_angstrom)
     return out
 
@@ -334,13 +312,6 @@ def _with_replaced_hydrogens(
         if not r.lacks_hydrogens
         and any(atoms[i].element == "H" and (r.key, atoms[i].position_angstrom) not in kept for i in r.atoms)
     ]
-
-
-def _distance(old: Sequence[int], new: Sequence[int], atoms: Sequence[AtomRecord], records: list[AtomRecord]) -> float:
-    gaps = [
-        np.subtract(atoms[i].position_angstrom, records[j].position_angstrom) for i, j in zip(old, new, strict=True)
-    ]
-    return float(np.square(gaps).sum())
 
 
 def _summary(residues: Sequence[Residue], records: Sequence[AtomRecord], ph: float) -> list[str]:
@@ -361,3 +332,240 @@ def _summary(residues: Sequence[Residue], records: Sequence[AtomRecord], ph: flo
         n = sum(a.element == "H" and a.residue_key in of_short for a in records)
         notes.append(f"hydrogens placed on {listed(short)}: {n}")
     return notes
+
+
+# ---- protonation ----------------------------------------------------------------------------------------------------
+
+
+# Hydrogens (in OpenMM's names) whose presence tells the protonation state.
+TITRATED = {"ASP": ("HD2",), "GLU": ("HE2",), "LYS": ("HZ1", "HZ2", "HZ3"), "HIS": ("HD1", "HE2"), "CYS": ("HG",)}
+_STATES = {
+    ("ASP", (False,)): "ASP charged", ("ASP", (True,)): "ASP neutral (ASH)", ("GLU", (False,)): "GLU charged",
+    ("GLU", (True,)): "GLU neutral (GLH)", ("LYS", (True, True, True)): "LYS charged",
+    ("LYS", (False, True, True)): "LYS neutral (LYN)", ("LYS", (True, True, False)): "LYS neutral (LYN)",
+    ("HIS", (True, True)): "HIS charged (HIP)", ("HIS", (True, False)): "HIS neutral (HID)",
+    ("HIS", (False, True)): "HIS neutral (HIE)", ("CYS", (True,)): "CYS neutral",
+}  # fmt: skip
+# A variant of Modeller's by name, the hydrogens one by one with their heavy atoms, or None: what pH decides.
+Asked = str | list[tuple[str, str]] | None
+# Hydrogens that Modeller's own rules count rightly: peptide bonds, and sulfurs in disulfides.
+_USUAL_LINKS = {"N": 1, "C": 1, "SG": 1}
+
+
+def asked_hydrogens(
+    residue: Residue, atoms: Sequence[AtomRecord], neighbours: Sequence[Sequence[int]], *, ph: float, in_cycle: bool
+) -> Asked:
+    """Return what to ask of Modeller for a residue.
+
+    Standard residues are left to its rules, in the protonation that the file shows. Components of the dictionary, and
+    standard residues where those rules fail (an end of the chain that a bond closes, a side chain bonded to another
+    residue), are asked for hydrogen by hydrogen: those of the file where it has all, else the dictionary's at this pH.
+    Raises PreparationError for a residue of which nothing is known.
+    """
+    assert residue.template is not None
+    links = links_of(residue, neighbours)
+    is_standard = template_for(residue.key[2]) is not None
+    if is_standard and not in_cycle and all(n <= _USUAL_LINKS.get(atom, 0) for atom, n in links.items()):
+        return variant_of(residue, atoms, neighbours)
+    if not residue.lacks_hydrogens:
+        return [
+            (atoms[h].name, name) for name, i in residue.heavy.items() for h in neighbours[i] if atoms[h].element == "H"
+        ]
+    found = component(residue.template.name)
+    if found is None:
+        raise PreparationError(f"{residue.label} lacks hydrogens, and the dictionary does not hold it; give them.")
+    return hydrogens_of(found, {*residue.heavy, *residue.missing}, links, ph=ph)
+
+
+def variant_of(residue: Residue, atoms: Sequence[AtomRecord], neighbours: Sequence[Sequence[int]]) -> str | None:
+    """Return Modeller's name of the protonation that the residue's own hydrogens or name show, or None."""
+    name = residue.key[2].upper()
+    named = {"HSD": "HID", "HSE": "HIE", "HSP": "HIP", "ASPP": "ASH", "GLUP": "GLH", "LSN": "LYN"}.get(name, name)
+    if named in ("CYX", "CYS2"):  # without its partner it is a cysteine like any other
+        return "CYX" if "SG" in links_of(residue, neighbours) else None
+    if named in ("HID", "HIE", "HIP", "ASH", "GLH", "LYN"):
+        return named
+    if named == "CYM":
+        return "CYX"
+    template = residue.template
+    if template is None or template.name not in ("HIS", "ASP", "GLU", "LYS"):
+        return None
+    count = {a: sum(atoms[j].element == "H" for j in neighbours[i]) for a, i in residue.heavy.items()}
+    if template.name == "HIS":
+        return {(1, 1): "HIP", (1, 0): "HID", (0, 1): "HIE"}.get((count.get("ND1", 0), count.get("NE2", 0)))
+    if template.name == "LYS":
+        return {2: "LYN", 3: "LYS"}.get(count.get("NZ", 0))
+    ends = sum(count.get(a, 0) for a in ("OD1", "OD2", "OE1", "OE2"))
+    if ends:
+        return "ASH" if template.name == "ASP" else "GLH"
+    return template.name if not residue.lacks_hydrogens else None
+
+
+def protonation_summary(
+    labels: Sequence[str],
+    keys: Sequence[ResidueKey],
+    given: Sequence[Asked],
+    records: Sequence[AtomRecord],
+    ph: float,
+) -> list[str]:
+    """One line for each kind of protonation that `ph` decided, that is where `given` holds no variant."""
+    hydrogens: dict[ResidueKey, set[str]] = {}
+    for atom in records:
+        if atom.element == "H":
+            hydrogens.setdefault(atom.residue_key, set()).add(atom.name)
+    states: dict[str, list[str]] = {}
+    for label, key, variant in zip(labels, keys, given, strict=True):
+        template = template_for(key[2])
+        if variant is None and template is not None and template.name in TITRATED:
+            marks = tuple(h in hydrogens.get(key, ()) for h in TITRATED[template.name])
+            if state := _STATES.get((template.name, marks)):
+                states.setdefault(state, []).append(label)
+    return [f"protonation at pH {ph:g}: {state}: {listed(found)}" for state, found in sorted(states.items())]
+
+
+# ---- side chains ----------------------------------------------------------------------------------------------------
+
+# PDBFixer adds missing atoms in the shape of its template, and parts overlaps by a few steps of minimisation, which in
+# crowded places ends in bonds of 2.7 Å or in atoms 2 Å apart. Here every torsion that the file leaves open is tried at
+# its rotamers (60°, 180°, -60°; every 30° where a planar group turns: the centres of Dunbrack's library, Acta Cryst.
+# D58, 1862 (2002)), and the conformer farthest from all other heavy atoms is taken.
+
+Sites = dict[str, int]
+
+_STAGGERED = (-60.0, 180.0, 60.0)
+_PLANAR = tuple(float(k) for k in range(-180, 180, 30))
+# The atom at the end of the last torsion that turns a planar group.
+_PLANAR_AT = {"ASP": "CG", "ASN": "CG", "PHE": "CG", "TYR": "CG", "TRP": "CG", "HIS": "CG", "GLU": "CD", "GLN": "CD"}
+_RIGID = frozenset({frozenset(("NE", "CZ"))})
+_BACKBONE = frozenset(("N", "C", "O", "OXT"))
+# Hydrogen bonds of heavy atoms start at 2.4 Å, contacts with carbon and sulfur at 3.0: nearer than the first an added
+# atom is built again, nearer than the second nothing is left to part.
+_NEAR_ANGSTROM, _NEAR_POLAR_ANGSTROM = 2.9, 2.4
+_OVERLAP_ANGSTROM = 2.1
+
+
+@lru_cache(maxsize=64)
+def residue_shape(name: str) -> Mapping[str, FloatArray]:
+    """Return the heavy atoms of PDBFixer's template of a residue, nm."""
+    path = Path(str(files("pdbfixer") / "templates" / f"{name}.pdb"))
+    return {a.name: np.array(a.position_angstrom) / 10.0 for a in read_structure(path).atoms if a.element != "H"}
+
+
+def resolve_side_chains(
+    positions_nm: FloatArray,
+    elements: Sequence[str],
+    bonds: Sequence[tuple[int, int]],
+    residues: Sequence[tuple[str, str, Sites, Sequence[str]]],
+) -> list[str]:
+    """Build added side chains that overlap again, in place; return a line for each.
+
+    `positions_nm` `(n_atoms, 3)`, heavy atoms alone; `bonds` pairs of them; `residues`: label, standard name, atoms by
+    name, and the names that were added. Raises PreparationError where an added atom stands in another in every rotamer.
+    """
+    graph = nx.Graph(bonds)
+    graph.add_nodes_from(range(len(elements)))
+    radii = np.array([covalent_radius_nm(e) for e in elements])
+    polar = np.array([e in ("N", "O") for e in elements])
+    notes = []
+    for label, name, sites, added in residues:
+        moved = [a for a in added if a in sites and a not in (*_BACKBONE, "CB")]
+        if not moved:
+            continue
+        idx = np.array([sites[a] for a in moved])
+        near = [sorted(nx.single_source_shortest_path_length(graph, int(i), cutoff=3)) for i in idx]
+
+        def clearance(x: FloatArray, idx: IntArray = idx, near: list[list[int]] = near) -> tuple[float, float]:
+            """The least distance of an added atom, and the least by which one exceeds what is called near, nm."""
+            gap = np.linalg.norm(x[idx, None] - x[None], axis=2)
+            for k, around in enumerate(near):
+                gap[k, around] = np.inf
+            limit = np.where(polar[idx, None] & polar[None], _NEAR_POLAR_ANGSTROM, _NEAR_ANGSTROM) / 10.0
+            return float(gap.min()), float((gap - limit).min())
+
+        joined = [(i, j) for i, j in bonds if i in idx or j in idx]
+        ratio = [float(np.linalg.norm(positions_nm[i] - positions_nm[j]) / (radii[i] + radii[j])) for i, j in joined]
+        off = any(not 0.75 < r < 1.25 for r in ratio)
+        least, margin = clearance(positions_nm)
+        if not off and margin >= 0:
+            continue
+        best = positions_nm.copy() if not off else None
+        for trial in _conformers(name, {a: positions_nm[i] for a, i in sites.items() if a not in moved}, moved):
+            x = positions_nm.copy()
+            x[idx] = [trial[a] for a in moved]
+            of_trial = clearance(x)
+            if best is None or of_trial[1] > margin + 1e-6:
+                best, (least, margin) = x, of_trial
+        if best is None:
+            continue  # its bonds are refused with their lengths
+        if 10.0 * least < _OVERLAP_ANGSTROM:
+            raise PreparationError(
+                f"{label}: {' '.join(moved)}, which were missing, come out {10 * least:.2f} Å from another heavy atom "
+                "in every rotamer; give the residue with all its heavy atoms, or make place for it."
+            )
+        if not np.array_equal(best, positions_nm):
+            positions_nm[:] = best
+            notes.append(f"{label}: {' '.join(moved)} overlapped and were built again in the rotamer with most room")
+    return notes
+
+
+def _conformers(name: str, there: Mapping[str, FloatArray], moved: Sequence[str]) -> list[dict[str, FloatArray]]:
+    """Positions in nm of the `moved` atoms of a residue in every combination of rotamers, `there` being its others;
+    none of proline, whose ring leaves no choice, nor where what they hang on is missing."""
+    shape = residue_shape(name)
+    tree = _tree(name)
+    if name == "PRO" or any(a not in shape or a not in tree for a in moved) or not {"N", "CA", "CB"} <= set(there):
+        return []
+    order = [a for a in tree if a in moved]
+    axes: list[tuple[str, str, str, str, tuple[float, ...]]] = []
+    for atom, (p, g, q) in tree.items():
+        if any(axis[1:3] == (g, p) for axis in axes) or frozenset((g, p)) in _RIGID:
+            continue
+        if _turns(name, g, p):
+            values: tuple[float, ...] = _PLANAR if _PLANAR_AT.get(name) == p else _STAGGERED
+            fixed = next((b for b, (pb, _, _) in tree.items() if pb == p and b in there), None)
+            if fixed is not None:
+                values = (_torsion_deg(there, q, g, p, fixed),)
+            axes.append((q, g, p, fixed or atom, values))
+    out = []
+    for chosen in product(*(values for *_, values in axes)):
+        turn = {(g, p): value - _torsion_deg(shape, q, g, p, d)
+                for (q, g, p, d, _), value in zip(axes, chosen, strict=True)}  # fmt: skip
+        placed = dict(there)
+        for atom in order:
+            p, g, q = tree[atom]
+            length = float(np.linalg.norm(shape[atom] - shape[p]))
+            u, v = shape[g] - shape[p], shape[atom] - shape[p]
+            bend = float(np.degrees(np.arccos(np.dot(u, v) / np.linalg.norm(u) / np.linalg.norm(v))))
+            value = _torsion_deg(shape, q, g, p, atom) + turn.get((g, p), 0.0)
+            placed[atom] = extend(placed[q], placed[g], placed[p], length, bend, value)
+        out.append({a: placed[a] for a in moved})
+    return out
+
+
+@lru_cache(maxsize=64)
+def _skeleton(name: str) -> nx.Graph:
+    template = template_for(name)
+    return nx.Graph() if template is None else nx.Graph(template.bonds)
+
+
+@lru_cache(maxsize=64)
+def _tree(name: str) -> dict[str, tuple[str, str, str]]:
+    """Of each side-chain atom beyond CB, nearest first, the three atoms that it hangs on: parent, grandparent, and
+    that one's parent."""
+    graph = _skeleton(name)
+    if "CB" not in graph:
+        return {}
+    graph = graph.subgraph([a for a in graph if a not in _BACKBONE])
+    parent = {"CA": "N", **{b: a for a, b in nx.bfs_edges(graph, "CA")}}
+    return {a: (parent[a], parent[parent[a]], parent[parent[parent[a]]]) for a in parent if a not in ("CA", "CB")}
+
+
+def _turns(name: str, a: str, b: str) -> bool:
+    """Whether the bond is in no ring."""
+    graph = _skeleton(name).copy()
+    graph.remove_edge(a, b)
+    return not nx.has_path(graph, a, b)
+
+
+def _torsion_deg(shape: Mapping[str, FloatArray], *names: str) -> float:
+    return float(np.degrees(torsion(np.array([shape[k] for k in names]), [[0, 1, 2, 3]])[0]))

@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import networkx as nx
 import numpy as np
-import numpy.typing as npt
 
 from systems.chemistry.geometry import near_pairs
 from systems.chemistry.residues import template_for
@@ -17,12 +14,10 @@ from systems.errors import PreparationError, listed
 from systems.options import Preparation
 from systems.prepare.bonding import find_bonds, links_residues
 from systems.prepare.checks import (
-    Handedness,
     caps_of,
     check_contacts,
     find_gaps,
     handedness,
-    heavy_of_records,
     made_whole,
     refuse_changed,
     refuse_gaps,
@@ -36,20 +31,22 @@ from systems.prepare.heterogens import (
     resolve_ligands,
     resolve_solvent,
 )
-from systems.prepare.read.mmcif_file import is_component
-from systems.prepare.read.mol2_file import read_peptide_mol2
-from systems.prepare.read.records import (
+from systems.prepare.mol2_file import read_peptide_mol2
+from systems.prepare.records import (
+    D_RESIDUES,
     AtomRecord,
     Bonding,
     Residue,
     StructureFile,
-    describe_residue,
+    by_residue,
+    distance_angstrom,
+    file_name_and_provenance,
+    scene_from_records,
     standardise,
     suffix_of,
 )
-from systems.prepare.read.structure_text import is_mmcif, read_structure, structure_text
-from systems.prepare.structure import atom_label, scene_from_records
-from systems.scene import Scene
+from systems.prepare.structure_text import is_component, is_mmcif, read_structure, structure_text
+from systems.scene import IntArray, Scene
 
 # Of a standard residue's atoms in any protonation, bonds to hydrogen among them.
 _MOST_BONDS = {"C": 4, "N": 4, "O": 2, "S": 2}
@@ -78,8 +75,8 @@ def _prepare_file(path: Path, options: Preparation) -> Scene:
     kept, wet = resolve_solvent(
         found.atoms, kept, keep_water=options.keep_water, keep_ions=options.keep_ligand, notes=repairs
     )
-    part = standardise([found.atoms[i] for i in kept], repairs)
-    structure = _Structure(part, *_reindexed(found.conect, found.chain_ends, kept))
+    structure = found.only(kept)
+    structure.atoms = standardise(structure.atoms, repairs)
     bonding = find_bonds(structure.atoms, structure.conect, structure.chain_ends)
     if bonding.unmade:
         repairs.append(f"stated bonds that are not made: {listed(bonding.unmade)}")
@@ -103,13 +100,14 @@ def _prepare_file(path: Path, options: Preparation) -> Scene:
     gaps = find_gaps(bonding, structure.chain_ends)
     if gaps and options.cap_breaks:
         caps = caps_of(gaps, structure.atoms, repairs)
-        structure = _Structure([*structure.atoms, *caps], structure.conect, structure.chain_ends)
+        structure.atoms = [*structure.atoms, *caps]
         bonding = find_bonds(structure.atoms, structure.conect, structure.chain_ends)
     refuse_gaps([] if options.cap_breaks else gaps, structure.atoms)
     repairs += bonding.notes
     repairs += _disulfides(bonding, structure.atoms)
     atoms, bonds = list(structure.atoms), bonding.bonds
-    before = _handedness(bonding, atoms)
+    known = [(r, r.template.name) for r in bonding.residues if r.template is not None]
+    before = handedness((r.key, name, {a: atoms[i] for a, i in r.heavy.items()}) for r, name in known)
     clashes = _clashing_hydrogens(atoms, bonds)
     if not bonding.is_complete:
         _refuse_beyond_repair(bonding, atoms)
@@ -117,9 +115,8 @@ def _prepare_file(path: Path, options: Preparation) -> Scene:
 
         atoms, bonds, summary = complete(atoms, bonding, ph=options.ph)
         repairs += summary
-        after = heavy_of_records(atoms)
-        names = {r.key: r.template.name for r in bonding.residues if r.template is not None}
-        hands = handedness((key, names[key], heavy) for key, heavy in after.items() if key in names)
+        now = by_residue(atoms)
+        hands = handedness((r.key, name, {atoms[i].name: atoms[i] for i in now.get(r.key, ())}) for r, name in known)
         refuse_changed(before, hands)
     else:
         hands = before
@@ -141,56 +138,16 @@ def _prepare_file(path: Path, options: Preparation) -> Scene:
     scene = scene_from_records(
         atoms,
         bonds,
-        name=path.name.removesuffix(".gz").rsplit(".", 1)[0],
-        provenance={
-            "source": "file",
-            "file": path.name,
-            "sha256": hashlib.sha256(path.read_bytes()).hexdigest(),
-            "ph": options.ph,
-            "repairs": repairs,
-        },
+        **file_name_and_provenance(path, repairs, ph=options.ph),
     )
     _refuse_long_double_bonds(scene)
     return scene
 
 
-@dataclass(frozen=True)
-class _Structure:
-    """Records with what the file says of their bonds (index pairs) and of chain ends (indices)."""
-
-    atoms: list[AtomRecord]
-    conect: list[tuple[int, int]]
-    chain_ends: set[int]
-
-    def only(self, chosen: Sequence[int]) -> _Structure:
-        return _Structure([self.atoms[i] for i in chosen], *_reindexed(self.conect, self.chain_ends, chosen))
-
-    def without(self, left_out: Sequence[int]) -> _Structure:
-        gone = set(left_out)
-        return self.only([i for i in range(len(self.atoms)) if i not in gone])
-
-
-def _reindexed(
-    conect: Sequence[tuple[int, int]], chain_ends: set[int], kept: Sequence[int]
-) -> tuple[list[tuple[int, int]], set[int]]:
-    new = {old: k for k, old in enumerate(kept)}
-    ends = {int(k) - 1 for k in np.searchsorted(kept, sorted(chain_ends), side="right")} - {-1}
-    return [(new[i], new[j]) for i, j in conect if i in new and j in new], ends
-
-
-def _handedness(bonding: Bonding, atoms: Sequence[AtomRecord]) -> Handedness:
-    return handedness(
-        (r.key, r.template.name, {a: atoms[i] for a, i in r.heavy.items()})
-        for r in bonding.residues
-        if r.template is not None
-    )
-
-
 def _disulfides(bonding: Bonding, atoms: Sequence[AtomRecord]) -> list[str]:
     sulfur = {r.heavy["SG"]: r for r in bonding.residues if "SG" in r.heavy}
     return [
-        f"disulfide bond {sulfur[i].label} - {sulfur[j].label} "
-        f"({np.linalg.norm(np.subtract(atoms[i].position_angstrom, atoms[j].position_angstrom)):.2f} Å)"
+        f"disulfide bond {sulfur[i].label} - {sulfur[j].label} ({distance_angstrom(atoms[i], atoms[j]):.2f} Å)"
         for i, j in bonding.bonds.tolist()
         if i in sulfur and j in sulfur
     ]
@@ -209,9 +166,11 @@ def _choose_alternates(found: StructureFile, repairs: list[str]) -> list[int]:
     groups = nx.Graph()
     occupancy: dict[tuple[str, str], dict[str, list[float]]] = {}
     for i in labelled:
-        groups.add_node(_place(atoms[i]))
-        occupancy.setdefault(_place(atoms[i]), {}).setdefault(atoms[i].altloc, []).append(atoms[i].occupancy)
-    groups.add_edges_from((_place(atoms[i]), _place(atoms[j])) for i, j in _bonds_of_alternates(found, labelled))
+        groups.add_node(atoms[i].residue_key[:2])
+        occupancy.setdefault(atoms[i].residue_key[:2], {}).setdefault(atoms[i].altloc, []).append(atoms[i].occupancy)
+    groups.add_edges_from(
+        (atoms[i].residue_key[:2], atoms[j].residue_key[:2]) for i, j in _bonds_of_alternates(found, labelled)
+    )
     chosen: dict[tuple[str, str], str] = {}
     for group in nx.connected_components(groups):
         of_label: dict[str, list[list[float]]] = {}
@@ -226,7 +185,7 @@ def _choose_alternates(found: StructureFile, repairs: list[str]) -> list[int]:
         order = sorted(of_label, key=rank, reverse=True)
         chosen |= {place: next(label for label in order if label in occupancy[place]) for place in group}
     chosen = {place: chosen[place] for place in occupancy}
-    kept = [i for i, a in enumerate(atoms) if not a.altloc or chosen[_place(a)] == a.altloc]
+    kept = [i for i, a in enumerate(atoms) if not a.altloc or chosen[a.residue_key[:2]] == a.altloc]
     instead = {(*atoms[i].residue_key, atoms[i].name): i for i in kept if atoms[i].altloc}
     stays = [instead.get((*a.residue_key, a.name), i) if a.altloc else i for i, a in enumerate(atoms)]
     found.conect = sorted({(min(p), max(p)) for p in ((stays[i], stays[j]) for i, j in found.conect) if p[0] != p[1]})
@@ -238,10 +197,6 @@ def _choose_alternates(found: StructureFile, repairs: list[str]) -> list[int]:
             f"{len(atoms) - len(kept)} atoms left out"
         )
     return kept
-
-
-def _place(atom: AtomRecord) -> tuple[str, str]:
-    return atom.chain, atom.residue_id
 
 
 def _bonds_of_alternates(found: StructureFile, labelled: Sequence[int]) -> list[tuple[int, int]]:
@@ -263,7 +218,7 @@ def _refuse_beyond_repair(bonding: Bonding, atoms: Sequence[AtomRecord]) -> None
             short = next(r for r in bonding.residues if r.missing or r.lacks_hydrogens)
             raise PreparationError(
                 f"{short.label} lacks atoms that cannot be added beside {residue.label}"
-                f"{describe_residue(residue.key[2])}, which is no standard residue; give the structure with all atoms "
+                f"{_handed(residue)}, which is no standard residue; give the structure with all atoms "
                 "and hydrogens."
             )
         essential = [a for a in ("N", "CA", "C") if a in residue.template.heavy and a in residue.missing]
@@ -276,29 +231,37 @@ def _refuse_beyond_repair(bonding: Bonding, atoms: Sequence[AtomRecord]) -> None
         if built and template_for(residue.key[2]) is None:
             instead = ", or leave its phosphate out" if "OP3" in built else ""
             raise PreparationError(
-                f"{residue.label}{describe_residue(residue.key[2])} lacks {' '.join(built)}; atoms are built for "
+                f"{residue.label}{_handed(residue)} lacks {' '.join(built)}; atoms are built for "
                 f"standard residues alone: add all its heavy atoms{instead}."
             )
 
 
-def _overfull(atoms: Sequence[AtomRecord], bonds: npt.NDArray[np.int64]) -> set[int]:
+def _handed(residue: Residue) -> str:
+    """What a residue that is no template is, with a leading comma, where it is a D-residue."""
+    name = D_RESIDUES.get(residue.key[2].upper())
+    return f", D-{name.lower()}" if name else ""
+
+
+def _overfull(atoms: Sequence[AtomRecord], bonds: IntArray) -> set[int]:
     """Return the atoms with more bonds than their element can have."""
     n_bonds = np.bincount(bonds.ravel(), minlength=len(atoms)).tolist()
     return {i for i, n in enumerate(n_bonds) if n > _MOST_BONDS.get(atoms[i].element, n)}
 
 
-def _clashing_hydrogens(atoms: Sequence[AtomRecord], bonds: npt.NDArray[np.int64]) -> list[PreparationError]:
+def _clashing_hydrogens(atoms: Sequence[AtomRecord], bonds: IntArray) -> list[PreparationError]:
     """Say which hydrogens of one residue stand at an atom of another that has all it can have: to be raised where
     placing hydrogens anew does not part them."""
-    found, overfull = [], _overfull(atoms, bonds)
-    for i, j in (*bonds.tolist(), *bonds[:, ::-1].tolist()) if overfull else ():
-        if j in overfull and atoms[i].element == "H" and atoms[i].residue_key != atoms[j].residue_key:
-            gap = np.linalg.norm(np.subtract(atoms[i].position_angstrom, atoms[j].position_angstrom))
-            found.append(PreparationError(
-                f"{atom_label(atoms[i])} and {atom_label(atoms[j])} are {gap:.2f} Å apart, and no bond can join them: "
-                "the atoms clash; model them again, or take all hydrogens out, which are then placed anew."
-            ))  # fmt: skip
-    return found
+    overfull = _overfull(atoms, bonds)
+    both = (*bonds.tolist(), *bonds[:, ::-1].tolist()) if overfull else ()
+    clashes = [(atoms[i], atoms[j]) for i, j in both if j in overfull and atoms[i].element == "H"]
+    return [
+        PreparationError(
+            f"{first.label} and {second.label} are {distance_angstrom(first, second):.2f} Å apart, and no bond can "
+            "join them: the atoms clash; model them again, or take all hydrogens out, which are then placed anew."
+        )
+        for first, second in clashes
+        if first.residue_key != second.residue_key
+    ]
 
 
 def _refuse_surplus_hydrogens(bonding: Bonding, atoms: Sequence[AtomRecord]) -> None:
@@ -318,12 +281,10 @@ def _refuse_surplus_hydrogens(bonding: Bonding, atoms: Sequence[AtomRecord]) -> 
 def _refuse_bare_skeletons(residues: Sequence[Residue], atoms: Sequence[AtomRecord]) -> None:
     """A molecule without any hydrogen is most often a file without hydrogens, and would get absurd double bonds."""
     for residue in residues:
-        symbols = [atoms[i].element for i in residue.atoms]
-        if residue.heavy or "C" not in symbols or "H" in symbols:
+        symbols = {atoms[i].element for i in residue.atoms}
+        if residue.heavy or "C" not in symbols or "H" in symbols or len(residue.atoms) <= 3:
             continue
-        if len(symbols) > 3 and not (
-            {"F", "Cl", "Br", "I"} & set(symbols) and set(symbols) <= _COMPLETE_WITHOUT_HYDROGEN
-        ):
+        if not {"F", "Cl", "Br", "I"} & symbols or not symbols <= _COMPLETE_WITHOUT_HYDROGEN:
             raise PreparationError(
                 f"{residue.label} has no hydrogens and is no standard amino acid; add them first (for instance "
                 "`obabel in.pdb -O out.pdb -h`)."

@@ -5,12 +5,11 @@ from __future__ import annotations
 import uuid
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
-from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, NotRequired, TypedDict
 
 from systems.errors import InputError, StorageError, SurromdError, TrajectoryError
-from systems.files.schema import built
+from systems.files.schema import fitted
 from systems.files.whole_file import OutputLock, create_whole, packed, refuse_existing, storage_error, unpacked
 from systems.scene import Scene
 from systems.trajectory.base import TrajectoryWriter
@@ -36,20 +35,18 @@ def new_header(n_files: int, *, overwrite: bool) -> dict[str, Any]:
     return {"run_id": uuid.uuid4().hex, "overwrite": overwrite, "files": [{"n_frames": 0, "digest": ""}] * n_files}
 
 
-@dataclass(frozen=True)
-class _Written:
+class _Written(TypedDict):
     n_frames: Annotated[int, range(2**63)]
     digest: str
 
 
-@dataclass(frozen=True)
-class _Common:
+class _Header(TypedDict):
     """What every checkpoint says, see `new_header`."""
 
     run_id: str
     overwrite: bool
-    files: tuple[_Written, ...]
-    n_frames_wanted: Annotated[int, range(2**63)] = 0
+    files: list[_Written]
+    n_frames_wanted: NotRequired[Annotated[int, range(2**63)]]
 
 
 def write_checkpoint(path: Path, header: dict[str, Any], blob: bytes) -> None:
@@ -78,7 +75,7 @@ def read_checkpoint(path: Path) -> Checkpoint:
         if not content.startswith(_MAGIC):
             raise ValueError("it is of another version of surromd, or no checkpoint")
         header, blob, _ = unpacked(content[len(_MAGIC) :])  # earlier versions wrote the state before behind the last
-        built(_Common, {f.name: header[f.name] for f in fields(_Common) if f.name in header})
+        fitted(header, _Header, "header")
     except (OSError, ValueError) as error:
         raise InputError(f"checkpoint {path} cannot be read ({error}); start again with `overwrite=True`.") from error
     return header, blob
@@ -130,9 +127,7 @@ def _unsupported(out: Path, header: dict[str, Any], k: int, *, begun: bool) -> s
             if reader.run_id != header["run_id"]:
                 return f"{out} is not the file that this run wrote, but another's in its place"
             if reader.n_frames < n_frames:
-                return (
-                    f"{out} holds {reader.n_frames} frames where its checkpoint has seen {n_frames}: it was cut short"
-                )
+                return f"{out} holds {reader.n_frames} frames, its checkpoint has seen {n_frames}: it was cut short"
             if n_frames and reader.digest(n_frames) != digest:
                 return f"{out} holds other frames than its checkpoint has seen"
             reader.verify(n_frames)
@@ -149,7 +144,7 @@ def locked_outputs(
     patience_s: float = 0.0,
     stopped: Callable[[], bool] = lambda: False,
 ) -> Iterator[None]:
-    """Hold the claims of a run's trajectories; when it fails, remove those it made that have no frames.
+    """Lock a run's trajectories; when it fails, remove those it made that have no frames.
 
     What there is to go on from is kept when the run was stopped, or the disk is full: files of a run with a checkpoint.
     Raises what `OutputLock` raises, TrajectoryError where one exists unless it `may_exist`, InputError where another

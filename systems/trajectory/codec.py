@@ -18,14 +18,24 @@ import numpy.typing as npt
 from systems.errors import InputError, TrajectoryError
 from systems.files.whole_file import OutputLock, journal_path
 from systems.scene import PARTICLE, Scene
-from systems.trajectory.base import TrajectoryReader, TrajectoryWriter, check_same_topology
-from systems.trajectory.frame_store import WEIGHTS, FrameBlock, FrameStore, open_hdf5
+from systems.trajectory.base import (
+    WEIGHTS,
+    Float32Array,
+    Float64Array,
+    FrameBlock,
+    FrameStore,
+    TrajectoryReader,
+    TrajectoryWriter,
+    check_same_topology,
+    open_hdf5,
+)
 from systems.units import GAS_CONSTANT_KJ_MOL_K
 
 __all__ = ["FrameBlock", "TrajectoryReader", "TrajectoryWriter", "companions", "open_trajectory", "open_writer"]
 
 _HDF5 = (".h5", ".hdf5")
 _WITH_COMPANIONS = (".dcd", ".xtc")
+_COLUMNS = ("velocities", "forces")
 # What trajectories are written as.
 WRITTEN = (*_HDF5, *_WITH_COMPANIONS)
 
@@ -43,15 +53,13 @@ def open_writer(
 ) -> TrajectoryWriter:
     """Start a trajectory file (`.h5`, `.hdf5`, `.dcd` or `.xtc`), or continue one with `append=True`.
 
-    Beside it stands `NAME.pdb`, its topology in its atom order (up to 99,999 atoms), beside a DCD or XTC also
-    `NAME.meta.h5` (record, exact times, flags). With `append` the file must be ours and hold the same ordered topology;
-    what it records stays, new keys of `record` are added, and an append that a crash interrupted is cut off. `record`
-    must be JSON-able. `columns`: what each frame has beside positions, 'velocities' and 'forces' (HDF5 only); the cell
-    of a periodic scene is kept in any case. `run_id`: whose file it is. The writer holds the file's claim
-    (systems.files.whole_file), unless its caller does (`claimed`). Raises InputError for an unknown suffix, column or
-    record; TrajectoryError when the file exists (and neither
-    `append` nor `overwrite` is set), is missing with `append`, damaged, of another topology, or written by another
-    process; StorageError when the folder is missing, not writable or full.
+    Beside it lies `NAME.pdb`, its topology (up to 99,999 atoms), beside a DCD or XTC also `NAME.meta.h5` (record, exact
+    times, flags). With `append` the file must be ours and hold the same ordered topology; new keys of `record` are
+    added, and an append that a crash interrupted is cut off. `columns`: what each frame has beside positions and cell,
+    'velocities' and 'forces' (HDF5 only). `run_id`: whose file it is. The writer locks the file, unless its caller has
+    (`locked`). Raises InputError for an unknown suffix or column, or a record that is not JSON; TrajectoryError when
+    the file exists already, is missing with `append`, damaged, of another topology, or written by another process;
+    StorageError when the folder is missing, not writable or full.
     """
     path = Path(path)
     if append and overwrite:
@@ -68,9 +76,9 @@ def open_writer(
         raise InputError(
             f"{path}: trajectories are written as .h5, .dcd or .xtc, not {path.suffix or 'without a suffix'!r}."
         )
+    from systems.trajectory.companion_writer import XtcWriter
     from systems.trajectory.dcd_file import DcdWriter
     from systems.trajectory.hdf5_file import Hdf5Writer
-    from systems.trajectory.xtc_file import XtcWriter
 
     lock = None if locked else OutputLock(path)
     how: dict[str, Any] = {"append": append, "overwrite": overwrite, "run_id": run_id}
@@ -95,17 +103,18 @@ def refuse_columns(path: Path, columns: Sequence[str]) -> None:
     if columns and path.suffix.lower() in _WITH_COMPANIONS:
         kind = path.suffix[1:].upper()
         raise InputError(f"{path}: {kind} files hold positions only; write an .h5 to keep {' and '.join(columns)}.")
+    for name in columns:
+        if name not in _COLUMNS:
+            raise InputError(f"{path}: no column {name!r} can be stored; known: {', '.join(_COLUMNS)}.")
 
 
 def companions(path: Path) -> tuple[Path, ...]:
     """Return the paths of what is written beside a trajectory."""
     from systems.trajectory import companion_writer
-    from systems.trajectory.companion_writer import topology_path
-
-    if path.suffix.lower() not in _WITH_COMPANIONS:
-        return topology_path(path), journal_path(path)
 
     pdb, meta = companion_writer.companions(path)
+    if path.suffix.lower() not in _WITH_COMPANIONS:
+        return pdb, journal_path(path)
     return pdb, meta, journal_path(meta)
 
 
@@ -114,53 +123,33 @@ def open_trajectory(path: str | Path, *, top: str | Path | None = None) -> Traje
     ASE trajectory where ase is installed.
 
     `top` names a structure or topology file for formats without topology; a DCD or XTC of ours finds its companions.
-    A file without our record has `record == {}` and `flags is None`; one without times has `times_known` False.
-    Warns (UserWarning) of a DCD of another program whose header states another number of frames than it holds.
-    Raises TrajectoryError when the file is missing, damaged or incomplete (it is never read as far as it goes);
-    InputError when a topology is needed, or does not fit.
+    Warns (UserWarning) of a DCD of another program whose header states another number of frames than it holds. Raises
+    TrajectoryError when the file is missing, damaged or incomplete (it is never read as far as it goes); InputError
+    when a topology is needed, or does not fit.
     """
-    path = Path(path)
-    top = None if top is None else Path(top)
-    is_hdf5 = path.suffix.lower() in _HDF5
-    if is_hdf5:
-        from systems.trajectory.hdf5_file import Hdf5Reader, is_plain_h5md
+    from systems.trajectory import companion_writer, dcd_file, foreign_readers, hdf5_file
+    from systems.trajectory.foreign_scenes import XYZ_SUFFIXES, is_mdtraj_format
 
-        if not is_plain_h5md(path):
-            return Hdf5Reader(path, top)
-    if is_hdf5 or path.suffix.lower() == ".h5md":
-        from systems.trajectory.hdf5_file import H5mdReader
-
-        return H5mdReader(path, top)
-    if path.suffix.lower() == ".dcd":
-        from systems.trajectory.dcd_file import DcdReader
-
-        return DcdReader(path, top)
-    if path.suffix.lower() == ".xtc":
-        from systems.trajectory.companion_writer import is_our_topology, topology_path
-        from systems.trajectory.xtc_file import XtcReader, is_ours
-
-        if is_ours(path):
-            return XtcReader(path, top)
-        top = topology_path(path) if top is None and is_our_topology(topology_path(path)) else top
-    if path.suffix.lower() == ".traj":
-        from systems.trajectory.xyz_file import AseReader
-
-        return AseReader(path, top)
-    from systems.trajectory.foreign_scenes import XYZ_SUFFIXES
-
+    path, top = Path(path), None if top is None else Path(top)
+    suffix = path.suffix.lower()
+    if suffix in _HDF5 and not hdf5_file.is_plain_h5md(path):
+        return hdf5_file.Hdf5Reader(path, top)
+    if suffix in (*_HDF5, ".h5md"):
+        return foreign_readers.H5mdReader(path, top)
+    if suffix == ".dcd":
+        return dcd_file.DcdReader(path, top)
+    if suffix == ".xtc":
+        if companion_writer.is_ours(path):
+            return companion_writer.XtcReader(path, top)
+        pdb = companion_writer.topology_path(path)
+        top = pdb if top is None and companion_writer.is_our_topology(pdb) else top
+    if suffix == ".traj":
+        return foreign_readers.AseReader(path, top)
     if path.name.lower().endswith(XYZ_SUFFIXES):
-        from systems.trajectory.xyz_file import XyzReader
-
-        return XyzReader(path, top)
-    from systems.trajectory.foreign_scenes import is_mdtraj_format
-
+        return foreign_readers.XyzReader(path, top)
     if is_mdtraj_format(path):
-        from systems.trajectory.foreign_readers import MdtrajReader
-
-        return MdtrajReader(path, top)
-    from systems.trajectory.foreign_readers import MdanalysisReader
-
-    return MdanalysisReader(path, top)
+        return foreign_readers.MdtrajReader(path, top)
+    return foreign_readers.MdanalysisReader(path, top)
 
 
 # ---- several replicas in one file -----------------------------------------------------------------------------------
@@ -179,23 +168,19 @@ def join(paths: Sequence[Path], out: Path, *, overwrite: bool = False) -> Path:
     """
     with ExitStack() as stack:
         readers = [stack.enter_context(open_trajectory(path)) for path in paths]
-        first = readers[0]
-        if first.scene is None:
-            raise InputError(f"{first.path} holds no topology; it cannot be joined.")
-        for reader in readers[1:]:
-            if reader.scene is None:
+        first, scene = readers[0], readers[0].scene
+        for reader in readers:
+            if reader.scene is None or scene is None:
                 raise InputError(f"{reader.path} holds no topology; it cannot be joined.")
-            check_same_topology(reader.path, reader.scene, first.scene)
+            check_same_topology(reader.path, reader.scene, scene)
+        assert scene is not None
         intervals = [float(np.median(np.diff(r.time_ps))) for r in readers if r.n_frames > 1]
         stated = first.record.get("save_every_ps")
         interval_ps = intervals[0] if intervals else float(stated) if isinstance(stated, int | float) else 1.0
         if any(abs(other - interval_ps) > 1e-6 * interval_ps for other in intervals):
             raise InputError(f"{out}: its replicas differ in the time between frames; join those of one interval.")
-        columns = [
-            name
-            for name, read in (("velocities", "read_velocities"), ("forces", "read_forces"))
-            if out.suffix.lower() not in (".dcd", ".xtc") and all(getattr(r, read)(0, 1) is not None for r in readers)
-        ]
+        columns = [] if out.suffix.lower() in _WITH_COMPANIONS else list(_COLUMNS)
+        columns = [c for c in columns if all(getattr(r, f"read_{c}")(0, 1) is not None for r in readers)]
         starts = np.cumsum([0, *(r.n_frames for r in readers)]).tolist()
         replicas = [
             {"file": r.path.name, "first_frame": begin, "n_frames": r.n_frames, "record": r.record}
@@ -205,7 +190,7 @@ def join(paths: Sequence[Path], out: Path, *, overwrite: bool = False) -> Path:
         common = {key: value for key, value in first.record.items() if all(r.record.get(key) == value for r in readers)}
         record = common | {KEY: {"replicas": replicas}, "completed": False}
         end_ps = 0.0
-        with open_writer(out, first.scene, record, overwrite=overwrite, columns=columns) as writer:
+        with open_writer(out, scene, record, overwrite=overwrite, columns=columns) as writer:
             for reader in readers:
                 if not reader.n_frames:
                     continue
@@ -245,18 +230,16 @@ def refuse_joined(reader: TrajectoryReader) -> None:
 
 
 def _copy(reader: TrajectoryReader, part: slice, writer: Any, shift_ps: float, columns: Sequence[str]) -> None:
-    extra: dict[str, npt.NDArray[Any] | None] = {"cell_nm": reader.read_cells(part.start, part.stop)}
-    if "velocities" in columns:
-        extra["velocities_nm_ps"] = reader.read_velocities(part.start, part.stop)
-    if "forces" in columns:
-        extra["forces_kj_mol_nm"] = reader.read_forces(part.start, part.stop)
+    frames = (part.start, part.stop)
     writer.append(
-        reader.read(part.start, part.stop),
+        reader.read(*frames),
         reader.time_ps[part] + shift_ps,
         flags=None if reader.flags is None else reader.flags[part],
         chunk_idx=None if reader.chunk_idx is None else reader.chunk_idx[part],
         scalars={name: values[part] for name, values in reader.scalars.items()},
-        **extra,
+        velocities_nm_ps=reader.read_velocities(*frames) if "velocities" in columns else None,
+        forces_kj_mol_nm=reader.read_forces(*frames) if "forces" in columns else None,
+        cell_nm=reader.read_cells(*frames),
     )
 
 
@@ -273,7 +256,7 @@ def to_mdtraj(
     """
     import mdtraj
 
-    from systems.chemistry.cell import lengths_and_angles
+    from systems.chemistry.distance_bonds import lengths_and_angles
 
     scene, positions, times, cells = _read(source, start, stop, stride)
     lengths, angles = (None, None) if cells is None else lengths_and_angles(cells)
@@ -293,7 +276,7 @@ def to_mdanalysis(
     import MDAnalysis
     from MDAnalysis.coordinates.memory import MemoryReader
 
-    from systems.chemistry.cell import lengths_and_angles
+    from systems.chemistry.distance_bonds import lengths_and_angles
 
     scene, positions, times, cells = _read(source, start, stop, stride)
     gaps = np.diff(times)
@@ -312,7 +295,9 @@ def to_mdanalysis(
     attributes = {
         "names": list(scene.atom_names), "types": elements, "elements": elements, "masses": scene.masses_da,
         "formalcharges": scene.formal_charges, "resnames": list(scene.residue_names),
-        "resids": np.arange(1, len(scene.residue_names) + 1), "resnums": _numbers(scene), "segids": chains,
+        "resids": np.arange(1, len(scene.residue_names) + 1), "segids": chains,
+        # Of the file, a residue's place in the scene where it has none.
+        "resnums": [int("".join(filter(str.isdigit, text)) or k) for k, text in enumerate(scene.residue_ids, start=1)],
     }  # fmt: skip
     for name, values in attributes.items():
         universe.add_TopologyAttr(name, values)
@@ -332,7 +317,7 @@ def to_mdanalysis(
 
 def _read(
     source: str | Path | TrajectoryReader, start: int, stop: int | None, stride: int
-) -> tuple[Scene, npt.NDArray[np.float32], npt.NDArray[np.float64], npt.NDArray[np.float64] | None]:
+) -> tuple[Scene, Float32Array, Float64Array, Float64Array | None]:
     if not isinstance(source, TrajectoryReader):
         with open_trajectory(source) as reader:
             return _read(reader, start, stop, stride)
@@ -342,30 +327,19 @@ def _read(
     return source.scene, positions, source.time_ps[start:stop:stride], source.read_cells(start, stop, stride)
 
 
-def _numbers(scene: Scene) -> list[int]:
-    """Residue numbers of the file, its position in the scene where it has none."""
-    found = []
-    for k, name in enumerate(scene.residue_ids, start=1):
-        digits = "".join(c for c in name if c.isdigit())
-        found.append(int(digits) if digits else k)
-    return found
-
-
 # ---- weights of frames ----------------------------------------------------------------------------------------------
 
 
-FloatArray = npt.NDArray[np.floating[Any]]
-
-# Scalar column of a rollout: U_truth - U_model in kJ/mol, NaN where the reference was not asked.
+# Scalar column of a rollout: U_reference - U_model in kJ/mol, NaN where the reference was not computed.
 DIFFERENCE_COLUMN = "energy_difference_kj_mol"
 
 
-def reweighting(differences_kj_mol: FloatArray, temperature_k: float) -> tuple[FloatArray, float]:
+def reweighting(differences_kj_mol: npt.ArrayLike, temperature_k: float) -> tuple[Float64Array, float]:
     """Return the weights `(n,)`, summing to one, that turn a potential's frames into those of the reference, and how
     many effective frames they leave (Kish: 1 / sum w^2).
 
-    `differences_kj_mol` (n,): U_truth - U_model at the frames; w is proportional to exp(-difference / kT). Independent
-    frames are assumed; correlation in time lessens the number further.
+    `differences_kj_mol` (n,): U_reference - U_model at the frames; w is proportional to exp(-difference / kT).
+    Independent frames are assumed; correlation in time lessens the number further.
     """
     reduced = -np.asarray(differences_kj_mol, dtype=np.float64) / (GAS_CONSTANT_KJ_MOL_K * temperature_k)
     weights = np.exp(reduced - reduced.max())
@@ -373,7 +347,7 @@ def reweighting(differences_kj_mol: FloatArray, temperature_k: float) -> tuple[F
     return weights, float(1.0 / np.square(weights).sum())
 
 
-def frame_weights(path: str | Path) -> npt.NDArray[np.float64]:
+def frame_weights(path: str | Path) -> Float64Array:
     """Return the weights `(n_frames,)` of a trajectory's frames at equilibrium; ones where the file has none.
 
     All replicas of one answer share a scale, mean 1 over all their frames: concatenate them as the frames. Raises
@@ -396,7 +370,7 @@ def frame_weights(path: str | Path) -> npt.NDArray[np.float64]:
     return np.ones(n_frames)
 
 
-def write_weights(path: Path, weights: npt.NDArray[np.float64]) -> None:
+def write_weights(path: Path, weights: Float64Array) -> None:
     """Write weights `(n_frames,)` into a trajectory of ours, or replace them. Raises InputError for another number of
     them, TrajectoryError for a file of others, StorageError."""
     with closing(FrameStore(_store(path))) as store:

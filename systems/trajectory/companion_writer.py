@@ -1,28 +1,48 @@
-"""What stands beside trajectories: `NAME.pdb` has the topology; `NAME.meta.h5` the rest, where a format holds positions
-alone.
+"""What lies beside trajectories: `NAME.pdb` has the topology; `NAME.meta.h5` the rest, where a format holds positions
+alone, as DCD (`dcd_file`) and XTC do.
 
-A trajectory is not read by its PDB, so that may be missing (files of earlier versions, copies); a file of another
-program is never replaced. The text is written here: every bond and the scene's own atom order must stand in it, while
-OpenMM's PDBFile writes CONECT records of non-standard residues alone (12 of alanine dipeptide's 21 bonds).
+A trajectory is not read by its PDB, so that may be missing. The text is written here, with every bond and in the
+scene's own atom order: OpenMM's PDBFile writes CONECT records of non-standard residues alone.
+
+`NAME.xtc` holds positions in nm to three decimals and times as float32. Frames are compressed and read by MDTraj. No
+library appends to a file whose last frame is cut short, or cuts one to a number of frames: where each frame ends stands
+in `NAME.meta.h5`, so that a run goes on behind the last whole one.
 """
 
 from __future__ import annotations
 
 import os
+import tempfile
 from abc import abstractmethod
-from contextlib import suppress
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
 import h5py
+import numpy as np
 import numpy.typing as npt
 
-from systems.errors import InputError, SurromdError, TrajectoryError
+from systems.errors import InputError, SurromdError, TrajectoryError, first_line
 from systems.files.whole_file import create_whole, refuse_existing, storage_error, write_whole
-from systems.prepare.read.structure_text import encode
+from systems.prepare.structure_text import encode, pdb_atom
 from systems.scene import Scene
-from systems.trajectory.base import TrajectoryWriter, check_same_topology
-from systems.trajectory.frame_store import CELLS, FRAMES, FrameBlock, FrameStore, create_store
+from systems.trajectory.base import (
+    CELLS,
+    ENDS,
+    FRAMES,
+    Float32Array,
+    Float64Array,
+    FrameBlock,
+    TrajectoryReader,
+    TrajectoryWriter,
+    add_column,
+    consistent_length,
+    create_store,
+    damage_reported,
+    open_hdf5,
+    unused_top_note,
+)
 
 MOST_ATOMS = 99_999
 # Between these a coordinate in Å fits its columns.
@@ -45,25 +65,16 @@ def pdb_text(scene: Scene) -> str:
     lines = [f"REMARK   1 surromd scene {scene.name}"]
     for i, (name, element) in enumerate(zip(scene.atom_names, scene.elements, strict=True)):
         res = scene.residue_of_atom[i]
-        padded = name[:4] if len(name) >= 4 or len(element) == 2 else f" {name}"
-        x, y, z = angstrom[i]
         resid = scene.residue_ids[res]
         number, insertion = (resid[:-1], resid[-1]) if resid and resid[-1].isalpha() else (resid, " ")
         if number.lstrip("-").isdigit():
             number = encode(int(number), 4) or number
         chain = (scene.chain_of_residue[res] or " ")[0]
-        lines.append(
-            f"ATOM  {i + 1:5d} {padded:<4s} {scene.residue_names[res][:3]:>3s} {chain}{number[-4:]:>4s}{insertion}   "
-            f"{x:8.3f}{y:8.3f}{z:8.3f}  1.00  0.00          {element:>2s}"
-        )
-    neighbours: dict[int, list[int]] = {}
-    for i, j in scene.bonds.tolist():
-        neighbours.setdefault(i, []).append(j)
-        neighbours.setdefault(j, []).append(i)
+        lines.append(pdb_atom(i + 1, name, element, scene.residue_names[res], chain, number, angstrom[i], insertion))
     lines.append("TER")
-    for i in sorted(neighbours):
-        for start in range(0, len(neighbours[i]), 4):
-            row = "".join(f"{j + 1:5d}" for j in sorted(neighbours[i])[start : start + 4])
+    for i, around in enumerate(scene.neighbours()):
+        for start in range(0, len(around), 4):
+            row = "".join(f"{j + 1:5d}" for j in around[start : start + 4])
             lines.append(f"CONECT{i + 1:5d}{row}")
     lines.append("END")
     return ("\n".join(lines) + "\n").encode("ascii", "replace").decode()
@@ -123,7 +134,7 @@ def _atoms(pdb: bytes) -> list[bytes]:
     return [line[:30] + line[54:] for line in pdb.splitlines() if line.startswith((b"ATOM", b"HETATM"))]
 
 
-# ---- writers of formats that hold positions alone -------------------------------------------------------------------
+# ---- formats that hold positions alone ------------------------------------------------------------------------------
 
 
 SUFFIXES = (".dcd", ".xtc")
@@ -143,51 +154,42 @@ class CompanionWriter(TrajectoryWriter):
     def __init__(
         self, path: Path, scene: Scene, record: dict[str, Any], *, append: bool, overwrite: bool, run_id: str = ""
     ) -> None:
-        self.path, self.scene, self._fd = path, scene, -1
+        self._fd = -1
         self._pdb, self._meta = companions(path)
         if not append:
-            self._create(record, overwrite, run_id)
+            self._create(path, scene, record, overwrite, run_id)
         if not self._meta.exists():
             raise TrajectoryError(f"{path} has no {self._meta.name} beside it and cannot be continued.")
-        self._store = FrameStore(self._meta)
+        super().__init__(path, self._meta, scene, record, append=append)
         try:
-            check_same_topology(path, self._store.scene, scene)
-            self._adopt()
-            self.n_frames, self.last_time_ps = self._store.n_frames, self._store.last_time_ps
-            new = {key: value for key, value in record.items() if key not in self._store.record}
-            if append and new:
-                self._store.update_record(new)
-            try:
-                self._fd = os.open(path, os.O_RDWR | getattr(os, "O_CLOEXEC", 0))
-                self._set_length(self.n_frames)
-            except OSError as error:
-                raise storage_error(path, error, "nothing was changed") from error
-        except BaseException:
+            self._fd = os.open(path, os.O_RDWR | getattr(os, "O_CLOEXEC", 0))
+            self._set_length(self.n_frames)
+        except OSError as error:
             self.close()
-            raise
+            raise storage_error(path, error, "nothing was changed") from error
 
-    def _create(self, record: dict[str, Any], overwrite: bool, run_id: str) -> None:
-        for file in (self.path, self._meta):
+    def _create(self, path: Path, scene: Scene, record: dict[str, Any], overwrite: bool, run_id: str) -> None:
+        for file in (path, self._meta):
             refuse_existing(file, overwrite)
         for suffix in SUFFIXES:
-            other = self.path.with_suffix(suffix)
-            if suffix != self.path.suffix.lower() and other.exists() and self._meta.exists():
+            other = path.with_suffix(suffix)
+            if suffix != path.suffix.lower() and other.exists() and self._meta.exists():
                 raise TrajectoryError(f"{self._meta} is the record of {other.name}; choose another name.")
-        topology = topology_bytes(self.scene)
-        refuse_other_topology(self.path, topology, overwrite=overwrite)
-        made = [file for file in (self._meta, self._pdb, self.path) if not file.exists()]
+        topology = topology_bytes(scene)
+        refuse_other_topology(path, topology, overwrite=overwrite)
+        made = [file for file in (self._meta, self._pdb, path) if not file.exists()]
         try:
             create_store(
                 self._meta,
-                self.scene,
+                scene,
                 record,
                 self._lay_out,
                 overwrite=overwrite,
                 run_id=run_id,
-                checksums=(FRAMES,) if self.scene.cell_nm is None else (FRAMES, CELLS),
+                checksums=(FRAMES,) if scene.cell_nm is None else (FRAMES, CELLS),
             )
-            write_topology(self.path, topology)
-            create_whole(self.path, self._head())
+            write_topology(path, topology)
+            create_whole(path, self._head(scene))
         except SurromdError:
             for file in made:
                 with suppress(OSError):
@@ -199,12 +201,8 @@ class CompanionWriter(TrajectoryWriter):
         """Make the columns of `NAME.meta.h5` that this format needs."""
 
     @abstractmethod
-    def _head(self) -> bytes:
+    def _head(self, scene: Scene) -> bytes:
         """Return what a file without frames holds."""
-
-    @abstractmethod
-    def _adopt(self) -> None:
-        """Learn how the file is laid out. Raises TrajectoryError where it is not ours, or lacks recorded frames."""
 
     @abstractmethod
     def _encoded(self, block: FrameBlock) -> tuple[bytes, dict[str, npt.NDArray[Any]], dict[str, npt.NDArray[Any]]]:
@@ -221,8 +219,8 @@ class CompanionWriter(TrajectoryWriter):
         """Make the header say so many frames, where there is one: one small write, which is atomic. Raises OSError."""
 
     def _append(self, block: FrameBlock) -> None:
-        self._refuse_closed()
-        self._store.check_flags(block)
+        with self._open():
+            self._check_flags(block)
         kind = self.path.suffix[1:].upper()
         if block.velocities_nm_ps is not None or block.forces_kj_mol_nm is not None:
             raise InputError(
@@ -238,15 +236,23 @@ class CompanionWriter(TrajectoryWriter):
             self._restate(self.n_frames + len(block))
             os.ftruncate(self._fd, start + len(data))
             os.fsync(self._fd)
-            self._store.append(block, columns, stored)
+            self._store(block, columns, stored)
         except BaseException as error:
-            # Taking space back needs none, so this also succeeds on a full disk; and frames too many do no harm.
-            self._forgotten(self.n_frames)
-            with suppress(OSError):
-                self._set_length(self.n_frames)
-            failed = self._store.failed(error) if isinstance(error, OSError) else error
+            failed = self.failed(error) if isinstance(error, OSError) else error
+            # The companion may hold these frames, where its own last step failed: what it lacks is cut off. Taking
+            # space back needs none, so this also succeeds on a full disk; and frames too many do no harm.
+            with suppress(OSError, SurromdError), open_hdf5(self._meta) as file:
+                n_frames = consistent_length(file, self._meta)
+                self._forgotten(n_frames)
+                self._set_length(n_frames)
             self.close()
             raise failed from error
+
+    def _cells(self, block: FrameBlock) -> Float64Array | None:
+        """The box vectors `(n, 3, 3)` nm of a block, the scene's own where it came without; None without a cell."""
+        if self.scene.cell_nm is None or block.cell_nm is not None:
+            return block.cell_nm
+        return np.broadcast_to(np.asarray(self.scene.cell_nm, dtype=np.float64), (len(block), 3, 3))
 
     def _written(self, block: FrameBlock, columns: dict[str, npt.NDArray[Any]]) -> None:
         """Remember what later frames depend on."""
@@ -260,17 +266,198 @@ class CompanionWriter(TrajectoryWriter):
         os.ftruncate(self._fd, self._offset(n_frames))
 
     def truncate(self, n_frames: int) -> None:
-        self._refuse_closed()
-        self._store.truncate(n_frames)
+        super().truncate(n_frames)
         self._forgotten(n_frames)
         try:
             self._set_length(n_frames)
         except OSError as error:
-            raise self._store.failed(error) from error
-        self.n_frames, self.last_time_ps = n_frames, self._store.last_time_ps
+            raise self.failed(error) from error
 
     def close(self) -> None:
         if self._fd >= 0:
             os.close(self._fd)
             self._fd = -1
         super().close()
+
+
+class CompanionReader(TrajectoryReader):
+    """Reads positions from one file and all else from `NAME.meta.h5`; both are refused unless they fit each other."""
+
+    def _read_companion(self, top: Path | None, *, with_ends: bool) -> npt.NDArray[np.int64]:
+        """Take what the companion says; return where each frame ends `(n_frames,)`, of an XTC file."""
+        meta = companions(self.path)[1]
+        with open_hdf5(meta) as file, damage_reported(meta):
+            if "surromd" not in file:
+                raise TrajectoryError(f"{meta} is not the record of {self.path.name}; move it to read the DCD alone.")
+            self._read_stored(file, meta)
+            ends: npt.NDArray[np.int64] = file[ENDS][: self.n_frames] if with_ends else np.empty(0, dtype=np.int64)
+        assert self.scene is not None
+        self.n_atoms = self.scene.n_atoms
+        if self._scene_of(top) is not None:
+            self.notes = (unused_top_note(top),)
+        return ends
+
+
+def unfit_size(path: Path, what_is_there: str, recorded: str) -> TrajectoryError:
+    """Return the error for a file that does not hold the frames which its companion records."""
+    return TrajectoryError(
+        f"{path} holds {what_is_there} where {companions(path)[1].name} records {recorded}: one of them is cut short "
+        "or replaced; restore both from one copy."
+    )
+
+
+# ---- XTC ------------------------------------------------------------------------------------------------------------
+
+
+# Three decimals in 32-bit integers.
+_MOST_NM = 2.0e6
+_DECODED_AT_ONCE = 4096
+
+
+class XtcWriter(CompanionWriter):
+    """Writes an XTC and its companions; see `systems.trajectory.codec.open_writer` for the arguments and errors."""
+
+    _ends: npt.NDArray[np.int64]
+
+    def _lay_out(self, file: h5py.File) -> None:
+        add_column(file, "time", 0, "<f8")
+        add_column(file, ENDS, 0, "<i8")
+
+    def _head(self, scene: Scene) -> bytes:
+        return b""
+
+    def _adopt(self) -> None:
+        if ENDS not in self.file:
+            raise TrajectoryError(f"{self._meta} is not the record of {self.path.name}; choose another name.")
+        self._ends = self.file[ENDS][: self.n_frames]
+        _check_size(self.path, self._ends, completed=False)
+
+    def _offset(self, n_frames: int) -> int:
+        return int(self._ends[n_frames - 1]) if n_frames else 0
+
+    def _encoded(self, block: FrameBlock) -> tuple[bytes, dict[str, npt.NDArray[Any]], dict[str, npt.NDArray[Any]]]:
+        beyond = ~(np.abs(block.positions_nm) < _MOST_NM).all(axis=(1, 2))
+        if beyond.any():
+            raise InputError(
+                f"{self.path}: frame {self.n_frames + int(np.argmax(beyond))} has positions that are not finite or too "
+                "large for an XTC; write an .h5."
+            )
+        cells = self._cells(block)
+        data, sizes = _compressed(block.positions_nm, block.time_ps, self._steps(block.time_ps), cells)
+        # Checksums are of what a reader gets.
+        positions, boxes = _decompressed(data, len(block), self.path, self.n_frames)
+        stored = {FRAMES: positions} if cells is None else {FRAMES: positions, CELLS: boxes}
+        return data, {ENDS: self._offset(self.n_frames) + np.cumsum(sizes)}, stored
+
+    def _steps(self, time_ps: Float64Array) -> npt.NDArray[np.int32]:
+        """Return the steps `(n,)` that go with times: of the integrator where the record states it, else frames."""
+        timestep = self.record.get("timestep_ps")
+        if isinstance(timestep, int | float) and timestep > 0 and time_ps[-1] / timestep < 2**31 - 1:
+            return np.rint(time_ps / timestep).astype(np.int32)
+        return np.arange(self.n_frames, self.n_frames + len(time_ps), dtype=np.int32)
+
+    def _written(self, block: FrameBlock, columns: dict[str, npt.NDArray[Any]]) -> None:
+        self._ends = np.concatenate([self._ends[: self.n_frames], columns[ENDS]])
+
+    def _forgotten(self, n_frames: int) -> None:
+        self._ends = self._ends[:n_frames]
+
+
+class XtcReader(CompanionReader):
+    """Reads our XTC files with their companions; those of other programs MDTraj reads (`foreign_readers`).
+
+    Raises TrajectoryError when the file is cut short or damaged, InputError when `top` does not fit.
+    """
+
+    def __init__(self, path: Path, top: Path | None) -> None:
+        super().__init__(path)
+        self._ends = self._read_companion(top, with_ends=True)
+        _check_size(path, self._ends, completed=self.record.get("completed") is True)
+        if self.scene is not None and not self.scene.positions_nm.any():
+            self.scene = self._at_first_frame(self.scene)
+
+    def _read(self, start: int, stop: int, stride: int) -> Float32Array:
+        frames = np.concatenate([x[::stride] for x, _ in self._decoded(start, stop, stride)])
+        self._check_read(FRAMES, frames, slice(start, stop, stride))
+        return frames
+
+    def _read_cells(self, start: int, stop: int, stride: int) -> Float64Array | None:
+        if CELLS not in self.checksums:
+            return None
+        if start >= stop:
+            return np.empty((0, 3, 3))
+        cells = np.concatenate([boxes[::stride] for _, boxes in self._decoded(start, stop, stride)])
+        self._check_read(CELLS, cells, slice(start, stop, stride))
+        return cells.astype(np.float64)
+
+    def _decoded(self, start: int, stop: int, stride: int) -> Iterator[tuple[Float32Array, Float32Array]]:
+        """Yield positions and boxes of frames `start:stop`, in blocks that begin at multiples of the stride."""
+        each = max(_DECODED_AT_ONCE // stride, 1) * stride
+        with self.path.open("rb") as file:
+            for first in range(start, stop, each):
+                last = min(first + each, stop)
+                begin = int(self._ends[first - 1]) if first else 0
+                file.seek(begin)
+                data = file.read(int(self._ends[last - 1]) - begin)
+                yield _decompressed(data, last - first, self.path, first)
+
+
+def is_ours(path: Path) -> bool:
+    """Whether `NAME.meta.h5` beside an XTC is the record of it. Raises TrajectoryError where that cannot be read."""
+    meta = companions(path)[1]
+    if not meta.exists():
+        return False
+    with open_hdf5(meta) as file:
+        return ENDS in file
+
+
+def _check_size(path: Path, ends: npt.NDArray[np.int64], *, completed: bool) -> None:
+    """Raise TrajectoryError unless the XTC holds the recorded frames; behind them a run may have some in flight."""
+    end, size = (int(ends[-1]) if len(ends) else 0), path.stat().st_size
+    if size < end or (size > end and completed):
+        raise unfit_size(path, f"{size} bytes", f"{len(ends)} frames of {end}")
+
+
+def _compressed(
+    positions_nm: Float32Array, time_ps: Float64Array, steps: npt.NDArray[np.int32], cells_nm: npt.ArrayLike | None
+) -> tuple[bytes, npt.NDArray[np.int64]]:
+    """Return frames as an XTC file has them, and the size of each, bytes."""
+    from mdtraj.formats import XTCTrajectoryFile
+
+    boxes = None if cells_nm is None else np.ascontiguousarray(cells_nm, dtype=np.float32)
+    with _scratch() as path:
+        with XTCTrajectoryFile(str(path), "w") as file:
+            file.write(np.ascontiguousarray(positions_nm), time=time_ps.astype(np.float32), step=steps, box=boxes)
+        data = path.read_bytes()
+        with XTCTrajectoryFile(str(path)) as file:
+            starts = np.asarray(file.offsets, dtype=np.int64)
+    return data, np.diff(np.append(starts, len(data)))
+
+
+def _decompressed(data: bytes, n_frames: int, path: Path, first: int) -> tuple[Float32Array, Float32Array]:
+    """Return positions `(n_frames, n_atoms, 3)` and box vectors `(n_frames, 3, 3)` nm of frames' bytes.
+
+    Raises TrajectoryError, which says where in `path`, when they are damaged.
+    """
+    from mdtraj.formats import XTCTrajectoryFile
+
+    with _scratch() as copy:
+        copy.write_bytes(data)
+        try:
+            with XTCTrajectoryFile(str(copy)) as file:
+                positions, _, _, boxes = file.read()
+        except Exception as error:  # MDTraj raises several kinds
+            raise TrajectoryError(
+                f"{path} is damaged in frames {first} to {first + n_frames} ({first_line(error)}); restore it from a "
+                "whole copy."
+            ) from error
+    if len(positions) != n_frames:
+        raise TrajectoryError(f"{path} is damaged at frame {first + len(positions)}; restore it from a whole copy.")
+    return positions, boxes
+
+
+@contextmanager
+def _scratch() -> Any:
+    """Make a path for MDTraj's library in C, which takes ASCII and files alone."""
+    with tempfile.TemporaryDirectory(prefix="surromd-") as folder:
+        yield Path(folder) / "frames.xtc"

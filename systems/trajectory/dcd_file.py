@@ -21,28 +21,18 @@ import h5py
 import numpy as np
 import numpy.typing as npt
 
-from systems.chemistry.cell import lengths_and_angles, read_cells
-from systems.errors import InputError, TrajectoryError
+from systems.chemistry.distance_bonds import lengths_and_angles, read_cells
+from systems.errors import TrajectoryError
 from systems.files.whole_file import write_whole
 from systems.scene import Scene
-from systems.trajectory.base import TrajectoryReader, unused_top_note
-from systems.trajectory.companion_writer import CompanionWriter, companions, is_our_topology
-from systems.trajectory.frame_store import (
-    CELLS,
-    ENDS,
-    FRAMES,
-    Float32Array,
-    Float64Array,
-    FrameBlock,
-    add_column,
-    consistent_length,
-    damage_reported,
-    get_json,
-    open_hdf5,
-    read_record,
-    read_run_id,
+from systems.trajectory.base import CELLS, ENDS, FRAMES, Float32Array, Float64Array, FrameBlock, add_column, open_hdf5
+from systems.trajectory.companion_writer import (
+    CompanionReader,
+    CompanionWriter,
+    companions,
+    is_our_topology,
+    unfit_size,
 )
-from systems.trajectory.hdf5_file import check_read, read_checksums, read_columns
 
 AKMA_PS = 4.888821e-2  # the value MDAnalysis and OpenMM use for CHARMM's unit of time
 _HEADER_BYTES = 92
@@ -76,16 +66,9 @@ class DcdLayout:
     charmm_version: int = 24
     notes: tuple[str, ...] = ()
 
-    def __eq__(self, other: object) -> bool:
-        if not isinstance(other, DcdLayout):
-            return NotImplemented
-        mine = (self.n_atoms, self.first_frame_at, self.byte_order, self.has_cell)
-        return mine == (other.n_atoms, other.first_frame_at, other.byte_order, other.has_cell)
-
-    @staticmethod
-    def ours(n_atoms: int, first_frame_at: int, *, has_cell: bool = False) -> DcdLayout:
-        """Return the layout we write."""
-        return DcdLayout(n_atoms, first_frame_at, has_cell=has_cell)
+    def is_ours(self, n_atoms: int, *, has_cell: bool) -> bool:
+        """Whether frames lie as we write them."""
+        return (self.n_atoms, self.byte_order, self.has_cell) == (n_atoms, "<", has_cell)
 
     @staticmethod
     def read(path: Path) -> DcdLayout:
@@ -114,14 +97,13 @@ class DcdLayout:
             raise TrajectoryError(f"{path} is cut short inside its header.") from error
         if not 1 <= n_atoms < _MOST_ATOMS:
             raise TrajectoryError(f"{path} is damaged: its header states {n_atoms} atoms.")
-        unit_ps = AKMA_PS
-        notes: tuple[str, ...] = ()
+        unit_ps, notes = AKMA_PS, list[str]()
         # MDTraj and VMD write a time step of one unit, whatever the times were.
         states_time = not (delta == 1.0 and fields[2] == 1)
         if _LAMMPS_TITLE in titles:
             # LAMMPS writes its time step in its own units, which no title names: fs (real), ps (metal) or reduced ones.
             unit_ps, states_time = 1e-3, bool(delta >= _LEAST_LAMMPS_FS)
-            notes = (_LAMMPS_NOTE if states_time else _LAMMPS_UNKNOWN,)
+            notes = [_LAMMPS_NOTE if states_time else _LAMMPS_UNKNOWN]
         # The time step is float32: digits beyond its seventh are noise.
         interval_ps = float(f"{float(delta) * unit_ps * max(int(fields[2]), 1):.6g}")
         states_time = states_time and bool(np.isfinite(interval_ps) and interval_ps > 0)
@@ -130,7 +112,7 @@ class DcdLayout:
         first_time_ps = interval_ps * int(fields[1]) / max(int(fields[2]), 1)
         return DcdLayout(n_atoms, first_frame_at, order, bool(charmm and fields[10]), int(fields[0]),
                          first_time_ps, interval_ps, size, path, _TITLE in titles, states_time,
-                         int(fields[19]), notes)  # fmt: skip
+                         int(fields[19]), tuple(notes))  # fmt: skip
 
     @property
     def frame_dtype(self) -> np.dtype[Any]:
@@ -147,7 +129,7 @@ class DcdLayout:
     def offset(self, frame: int) -> int:
         return self.first_frame_at + frame * int(self.frame_dtype.itemsize)
 
-    def times_ps(self, n_frames: int) -> npt.NDArray[np.float64]:
+    def times_ps(self, n_frames: int) -> Float64Array:
         return self.first_time_ps + self.interval_ps * np.arange(n_frames, dtype=np.float64)
 
     def whole_frames(self) -> int:
@@ -167,7 +149,7 @@ class DcdLayout:
         return n
 
 
-def step_fields(times_ps: npt.NDArray[np.float64], record: dict[str, Any]) -> tuple[int, int, float]:
+def step_fields(times_ps: Float64Array, record: dict[str, Any]) -> tuple[int, int, float]:
     """Return `(first step, steps between frames, time step in ps)` for the header.
 
     In units of the integration step where the record states one that divides the times, else of the interval.
@@ -199,7 +181,7 @@ def cell_blocks(cell_nm: npt.ArrayLike) -> npt.NDArray[np.int32]:
 
 def cells_of_blocks(
     blocks: npt.NDArray[np.int32], byte_order: str, charmm_version: int = _LAST_VERSION_WITH_ANGLES
-) -> npt.NDArray[np.float64] | None:
+) -> Float64Array | None:
     """Return box vectors `(n, 3, 3)` nm of unit-cell blocks `(n, 14)`, None of such as hold zeros.
 
     Between the lengths stand angles in degrees (most programs), their cosines (NAMD), or the elements of CHARMM's
@@ -222,7 +204,7 @@ def cells_of_blocks(
     return read_cells(0.1 * lengths, angles)
 
 
-def _are_angles(angles: npt.NDArray[np.float64]) -> bool:
+def _are_angles(angles: Float64Array) -> bool:
     """Whether a cell can have these angles `(n, 3)`, degrees."""
     alpha, beta, gamma = np.cos(np.radians(angles)).T
     volume = 1.0 - alpha**2 - beta**2 - gamma**2 + 2.0 * alpha * beta * gamma
@@ -261,17 +243,16 @@ class DcdWriter(CompanionWriter):
     def _lay_out(self, file: h5py.File) -> None:
         add_column(file, "time", 0, "<f8")
 
-    def _head(self) -> bytes:
-        header = header_bytes(0, 0, 1, 0.0, has_cell=self.scene.cell_nm is not None)
-        return header + title_bytes(self.scene.n_atoms)
+    def _head(self, scene: Scene) -> bytes:
+        return header_bytes(0, 0, 1, 0.0, has_cell=scene.cell_nm is not None) + title_bytes(scene.n_atoms)
 
     def _adopt(self) -> None:
         layout = DcdLayout.read(self.path)
-        ours = DcdLayout.ours(self.scene.n_atoms, layout.first_frame_at, has_cell=self.scene.cell_nm is not None)
-        if layout != ours or ENDS in self._store.file:
+        is_ours = layout.is_ours(self.scene.n_atoms, has_cell=self.scene.cell_nm is not None)
+        if not is_ours or ENDS in self.file:
             raise TrajectoryError(f"{self.path} was not written by surromd and cannot be continued; take another name.")
-        _check_against_meta(self.path, layout, self._store.n_frames, completed=False)
-        self._layout, self._first_times = layout, self._store.first_times_ps()
+        _check_against_meta(self.path, layout, self.n_frames, completed=False)
+        self._layout, self._first_times = layout, self.first_times_ps()
 
     def _offset(self, n_frames: int) -> int:
         return self._layout.offset(n_frames)
@@ -283,15 +264,14 @@ class DcdWriter(CompanionWriter):
         for axis in range(3):
             frames[f"before{axis}"] = frames[f"after{axis}"] = 4 * self.scene.n_atoms
             frames[f"x{axis}"] = angstrom[:, :, axis]
-        if self._layout.has_cell:
-            own = np.broadcast_to(np.asarray(self.scene.cell_nm, dtype=np.float64), (len(block), 3, 3))
-            stored[CELLS] = frames["cell"] = cell_blocks(own if block.cell_nm is None else block.cell_nm)
+        if (cells := self._cells(block)) is not None:
+            stored[CELLS] = frames["cell"] = cell_blocks(cells)
         return frames.tobytes(), {}, stored
 
     def _restate(self, n_frames: int) -> None:
         first, nsavc, timestep_ps = 0, 1, 0.0
         if len(self._first_times):
-            first, nsavc, timestep_ps = step_fields(self._first_times, self._store.record)
+            first, nsavc, timestep_ps = step_fields(self._first_times, self.record)
         write_whole(self._fd, header_bytes(n_frames, first, nsavc, timestep_ps, has_cell=self._layout.has_cell), 0)
 
     def _written(self, block: FrameBlock, columns: dict[str, npt.NDArray[Any]]) -> None:
@@ -301,7 +281,7 @@ class DcdWriter(CompanionWriter):
         self._first_times = self._first_times[:n_frames]
 
 
-class DcdReader(TrajectoryReader):
+class DcdReader(CompanionReader):
     """Reads our DCD files with their companions, and plain ones (32-bit, no fixed atoms) of other programs.
 
     Without companions times come from the header (1 ps a frame where it states no time step) and `scene` from `top`.
@@ -309,41 +289,26 @@ class DcdReader(TrajectoryReader):
     """
 
     def __init__(self, path: Path, top: Path | None) -> None:
-        self.path = path
+        super().__init__(path)
         self._layout = layout = DcdLayout.read(path)
-        self.n_atoms = layout.n_atoms
         pdb, meta = companions(path)
         if meta.exists() and not _is_of_xtc(meta):
-            with open_hdf5(meta) as file, damage_reported(meta):
-                if "surromd" not in file:
-                    raise TrajectoryError(f"{meta} is not the record of {path.name}; move it to read the DCD alone.")
-                self.n_frames = consistent_length(file, meta)
-                self.time_ps, self.flags, self.chunk_idx, self.scalars = read_columns(file, meta, self.n_frames)
-                self.checksums, self.run_id = read_checksums(file, self.n_frames), read_run_id(file)
-                self.record = read_record(file)
-                self.scene = Scene.from_dict(get_json(file, "surromd/scene"))
+            self._read_companion(top, with_ends=False)
             _check_against_meta(path, layout, self.n_frames, completed=self.record.get("completed") is True)
-            if top is not None:
-                _scene_from_top(top, path, self.n_atoms)
-                self.notes = (unused_top_note(top),)
+            if self.n_atoms != layout.n_atoms:
+                raise TrajectoryError(f"{path} holds {layout.n_atoms} atoms a frame, its record {self.n_atoms}.")
         else:
-            self.n_frames = layout.whole_frames()
+            self.n_atoms, self.n_frames = layout.n_atoms, layout.whole_frames()
             self.time_ps, self.times_known = layout.times_ps(self.n_frames), layout.states_time
-            self.record, self.flags, self.chunk_idx, self.scalars = {}, None, None, {}
-            self.scene, self.notes = None, layout.notes
-            if top is not None or is_our_topology(pdb):
-                self.scene = _scene_from_top(top or pdb, path, self.n_atoms)
-        if self.scene is not None and self.scene.n_atoms != self.n_atoms:
-            raise TrajectoryError(f"{path} holds {self.n_atoms} atoms a frame, its record {self.scene.n_atoms}.")
-        self._frames: npt.NDArray[Any] | None = np.empty(0, dtype=layout.frame_dtype)
+            self.notes = layout.notes
+            self.scene = self._scene_of(top or (pdb if is_our_topology(pdb) else None))
+        self._frames: npt.NDArray[Any] = np.empty(0, dtype=layout.frame_dtype)
         if self.n_frames:
             self._frames = np.memmap(path, layout.frame_dtype, "r", layout.first_frame_at, (self.n_frames,))
             if self.scene is not None and not self.scene.positions_nm.any():
-                self.scene = self.scene.with_positions(self._read(0, 1, 1)[0])
+                self.scene = self._at_first_frame(self.scene)
 
     def _read(self, start: int, stop: int, stride: int) -> Float32Array:
-        if self._frames is None:
-            raise InputError(f"{self.path} is closed.")
         frames = self._frames[start:stop:stride]
         out = np.empty((len(frames), self.n_atoms, 3), dtype=np.float32)
         for axis in range(3):
@@ -352,17 +317,15 @@ class DcdReader(TrajectoryReader):
                 bad = start + stride * int(np.argmin(lengths))
                 raise TrajectoryError(f"{self.path} is damaged at frame {bad}; restore it from a whole copy.")
             out[:, :, axis] = frames[f"x{axis}"]
-        check_read(self, FRAMES, out, slice(start, stop, stride))
+        self._check_read(FRAMES, out, slice(start, stop, stride))
         out *= np.float32(0.1)
         return out
 
-    def _read_cells(self, start: int, stop: int, stride: int) -> npt.NDArray[np.float64] | None:
-        if self._frames is None:
-            raise InputError(f"{self.path} is closed.")
+    def _read_cells(self, start: int, stop: int, stride: int) -> Float64Array | None:
         if not self._layout.has_cell:
             return None
         blocks = np.asarray(self._frames["cell"][start:stop:stride])
-        check_read(self, CELLS, blocks, slice(start, stop, stride))
+        self._check_read(CELLS, blocks, slice(start, stop, stride))
         try:
             return cells_of_blocks(blocks, self._layout.byte_order, self._layout.charmm_version)
         except ValueError as error:
@@ -371,7 +334,8 @@ class DcdReader(TrajectoryReader):
             ) from error
 
     def close(self) -> None:
-        self._frames = None
+        super().close()
+        self._frames = np.empty(0)  # gives the file's pages back
 
 
 def _is_of_xtc(meta: Path) -> bool:
@@ -384,16 +348,4 @@ def _check_against_meta(path: Path, layout: DcdLayout, n_frames: int, *, complet
     extra = layout.file_bytes - layout.offset(n_frames)
     if extra < 0 or (extra and completed):
         whole = (layout.file_bytes - layout.first_frame_at) // layout.frame_dtype.itemsize
-        raise TrajectoryError(
-            f"{path} holds {whole} whole frames where {companions(path)[1].name} records {n_frames}: one of them is "
-            "cut short or replaced; restore both from one copy."
-        )
-
-
-def _scene_from_top(top: Path, path: Path, n_atoms: int) -> Scene:
-    from systems.trajectory.foreign_scenes import scene_from_structure
-
-    scene = scene_from_structure(top, name=path.stem)
-    if scene.n_atoms != n_atoms:
-        raise InputError(f"{top} has {scene.n_atoms} atoms, {path} has {n_atoms}; give the matching structure.")
-    return scene
+        raise unfit_size(path, f"{whole} whole frames", str(n_frames))

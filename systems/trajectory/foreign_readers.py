@@ -1,41 +1,51 @@
-"""Trajectories of other programs, through the readers of MDTraj and of MDAnalysis, and what both leave out: units of
-NetCDF, TRR frames without positions, odd paths.
+"""Trajectories of other programs: through the readers of MDTraj, MDAnalysis and ASE, with what these leave out (units
+of NetCDF, TRR frames without positions, odd paths, atoms in another order); H5MD and extended XYZ, read here.
 
 Which one reads a format, and what it would make up, stands in `foreign_scenes`. What both read MDTraj reads, block by
-block.
+block. XYZ: positions in Å; `Lattice`, `pbc` and `Properties` of each frame's second line are read
+(https://github.com/libAtoms/extxyz): `Lattice` holds the rows a, b, c; `Properties` the columns as `name:type:number`
+(`species:S:1:pos:R:3` where there is none).
 """
 
 from __future__ import annotations
 
+import bz2
 import contextlib
+import gzip
 import importlib
+import itertools
 import re
 import tempfile
 import warnings
-from collections.abc import Iterable, Sequence
+import zlib
+from collections import Counter
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from typing import IO, Any, NamedTuple
 
+import h5py
 import numpy as np
 import numpy.typing as npt
 
-from systems.chemistry.cell import read_cells
+from systems.chemistry.distance_bonds import read_cells
+from systems.chemistry.element_data import element_symbol
 from systems.errors import InputError, TrajectoryError, first_line
-from systems.trajectory.base import TrajectoryReader
+from systems.files.outside import UNREADABLE
+from systems.scene import IntArray
+from systems.trajectory.base import Float32Array, Float64Array, TrajectoryReader, damage_reported, open_hdf5
 from systems.trajectory.foreign_scenes import (
     NONE,
     SOME,
     Format,
     bonds_completed,
     format_of,
+    named_scene,
     nm_per,
     ps_per,
     scene_from_mdtraj_topology,
     scene_from_structure,
     scene_from_universe,
 )
-from systems.trajectory.frame_store import Float32Array, Float64Array
-from systems.trajectory.xyz_file import IntArray, arc_names, gro_frames, moved_note, orders, pdb_names
 
 _TRR_MAGIC = 1993
 # Of the header's ten sizes: box, virial, pressure, (topology), positions, velocities and forces have bytes behind it.
@@ -52,7 +62,7 @@ def unit_note(format_: Format) -> tuple[str, ...]:
     return (f"a {format_.name} file states no unit of length; {format_.unit_taken} is taken.",)
 
 
-def counted_note(time_ps: npt.NDArray[np.float64]) -> tuple[str, ...]:
+def counted_note(time_ps: Float64Array) -> tuple[str, ...]:
     """Return the line on times `(n_frames,)` that are what MDTraj writes where nobody stated any."""
     if len(time_ps) < 3 or not np.array_equal(time_ps, np.arange(len(time_ps))):
         return ()
@@ -138,7 +148,88 @@ class AsciiPath:
         self._folder = None
 
 
-# ---- readers --------------------------------------------------------------------------------------------------------
+# ---- atoms that move from frame to frame ----------------------------------------------------------------------------
+
+
+def _open_text(path: Path) -> IO[str]:
+    """Open a text file, a compressed one (.gz, .bz2) too."""
+    opened: Any = {".gz": gzip.open, ".bz2": bz2.open}.get(path.suffix.lower(), open)
+    file: IO[str] = opened(path, "rt", encoding="utf-8", errors="replace")
+    return file
+
+
+def order_of(names: Sequence[str], first: Sequence[str], path: Path, frame: int) -> IntArray | None:
+    """Return where each atom of the first frame stands in a later one `(n_atoms,)`, None where nothing moved.
+
+    Raises TrajectoryError where the frames hold different atoms, or moved ones that share a name.
+    """
+    if names == first:
+        return None
+    if len(names) != len(first):
+        raise TrajectoryError(
+            f"{path}: frame {frame} has {len(names)} atoms, not as many as the first ({len(first)}); split the file."
+        )
+    moved = [k for k, (one, two) in enumerate(zip(names, first, strict=True)) if one != two]
+    k, count = moved[0], Counter(first)
+    here = f"{path}: frame {frame} names other atoms than the first (atom {k + 1} is {names[k]!r}, not {first[k]!r})"
+    if Counter(names) != count:
+        raise TrajectoryError(f"{here}; split the file.")
+    if any(count[first[k]] > 1 for k in moved):
+        raise TrajectoryError(f"{here}, and names that occur twice do not tell the order; write it again in one order.")
+    order = np.arange(len(first))
+    place = {names[k]: k for k in moved}
+    order[moved] = [place[first[k]] for k in moved]
+    return order
+
+
+def _pdb_names(path: Path) -> Iterator[list[str]]:
+    """Yield atom name, alternate, residue and element of all atoms of each model of a PDB file."""
+    names: list[str] = []
+    with _open_text(path) as file:
+        for line in file:
+            if line.startswith(("ATOM", "HETATM")):
+                names.append(" ".join(f"{line[12:27]} {line[76:78]}".split()))
+            elif line.startswith("END") and names:
+                yield names
+                names = []
+    if names:
+        yield names
+
+
+def _arc_names(path: Path) -> Iterator[list[str]]:
+    """Yield name and type of all atoms of each frame of a Tinker archive."""
+    with _open_text(path) as file:
+        for title in file:
+            words = title.split()
+            if not words or not words[0].isdigit():
+                return
+            names: list[str] = []
+            while len(names) < int(words[0]) and (row := file.readline().split()):
+                if len(row) > 5 and not row[1].replace(".", "").isdigit():  # else the cell
+                    names.append(f"{row[1]} {row[5]}")
+            yield names
+
+
+def _gro_frames(path: Path) -> Iterator[tuple[str, list[str]]]:
+    """Yield the title, and residue and name of all atoms, of each frame of a GRO file."""
+    with _open_text(path) as file:
+        for title in file:
+            count = file.readline().strip()
+            if not count.isdigit():
+                return
+            names = [" ".join(f"{line[:10]} {line[10:15]}".split()) for line in itertools.islice(file, int(count))]
+            file.readline()
+            yield title, names
+
+
+def _moved_note(moved: dict[int, IntArray]) -> tuple[str, ...]:
+    """Return the line on reordered frames, none where none is."""
+    if not moved:
+        return ()
+    return (f"{len(moved)} frames, from {min(moved)} on, list their atoms in another order; matched by their names.",)
+
+
+# ---- MDTraj and MDAnalysis ------------------------------------------------------------------------------------------
 
 
 _PASS_FRAMES = 4096
@@ -153,12 +244,9 @@ class MdtrajReader(TrajectoryReader):
     """
 
     def __init__(self, path: Path, top: Path | None) -> None:
-        self.path, self._format = path, format_of(path)
-        if not path.exists():
-            raise TrajectoryError(f"{path} does not exist.")
-        self.record, self.flags, self.chunk_idx, self.scalars = {}, None, None, {}
+        super().__init__(path)
+        self._format = format_of(path)
         self.notes = unit_note(self._format)
-        self.scene = None
         self._whole: Any = None
         self._file: Any = None
         self._kept: IntArray | None = None
@@ -179,12 +267,10 @@ class MdtrajReader(TrajectoryReader):
         if stated is not None and stated.n_atoms != self.n_atoms:
             self.close()
             raise InputError(f"{top} has {stated.n_atoms} atoms, {path} has {self.n_atoms}; give the matching one.")
-        if not self.n_frames:
-            return
-        first = self._read(0, 1, 1)[0]
         if stated is not None:
-            self.scene = stated.with_positions(first)
-        elif not streamed:
+            self.scene = self._at_first_frame(stated)
+        elif not streamed and self.n_frames:
+            first = self._read(0, 1, 1)[0]
             made = scene_from_mdtraj_topology(self._whole.topology, first, name=path.stem, source=path.name)
             self.scene = bonds_completed(made, self._read_cells(0, 1, 1))
 
@@ -210,27 +296,33 @@ class MdtrajReader(TrajectoryReader):
         self.time_ps, self.times_known = np.asarray(frames.time, dtype=np.float64), self._format.times != NONE
         suffix = path.name.lower()
         if suffix.endswith(".gro"):
-            titles = []
-            self._put_in_order(frames, (titles.append(title) or names for title, names in gro_frames(path)))  # type: ignore[func-returns-value]
+            titled = list(_gro_frames(path))
+            self._put_in_order(frames, [names for _, names in titled])
             # Where one title states no time MDTraj counts frames.
-            self.times_known = all(_GRO_TIME.search(title) for title in titles)
+            self.times_known = all(_GRO_TIME.search(title) for title, _ in titled)
         elif suffix.endswith((".pdb", ".pdb.gz")):
-            self._put_in_order(frames, pdb_names(path))
+            self._put_in_order(frames, _pdb_names(path))
         elif suffix.endswith(".arc"):
-            self._put_in_order(frames, arc_names(path))
+            self._put_in_order(frames, _arc_names(path))
         return frames
 
     def _put_in_order(self, frames: Any, names: Iterable[Sequence[str]]) -> None:
         """Put the atoms of each frame into the first one's order: MDTraj goes by their place."""
-        moved, n_atoms = orders(names, self.path)
-        if moved and (n_atoms != self.n_atoms or max(moved) >= self.n_frames):
+        first: Sequence[str] = ()
+        moved: dict[int, IntArray] = {}
+        for frame, here in enumerate(names):
+            first = here if frame == 0 else first
+            order = order_of(here, first, self.path, frame)
+            if order is not None:
+                moved[frame] = order
+        if moved and (len(first) != self.n_atoms or max(moved) >= self.n_frames):
             raise TrajectoryError(
                 f"{self.path}: later frames list their atoms in another order, and MDTraj leaves some out; write it "
                 "again in one order, without alternates."
             )
         for frame, order in moved.items():
             frames.xyz[frame] = frames.xyz[frame][order]
-        self.notes += moved_note(moved)
+        self.notes += _moved_note(moved)
 
     def _open(self, path: Path) -> None:
         import mdtraj
@@ -265,8 +357,6 @@ class MdtrajReader(TrajectoryReader):
 
     def _stored(self, start: int, stop: int) -> list[Any]:
         """Return what MDTraj reads of frames `start:stop`, positions first; frames without positions do not count."""
-        if self._file is None:
-            raise InputError(f"{self.path} is closed.")
         kept = None if self._kept is None else self._kept[start:stop]
         first, last = (start, stop) if kept is None else (int(kept[0]), int(kept[-1]) + 1)
         try:
@@ -304,6 +394,7 @@ class MdtrajReader(TrajectoryReader):
         return cells[::stride] if cells is not None and cells.ndim == 3 and cells.any() else None
 
     def close(self) -> None:
+        super().close()
         if self._file is not None:
             self._file.close()
         self._file = None
@@ -317,10 +408,7 @@ class MdanalysisReader(TrajectoryReader):
         import MDAnalysis
         from MDAnalysis.coordinates.core import get_reader_for
 
-        self.path = path
-        if not path.exists():
-            raise TrajectoryError(f"{path} does not exist.")
-        self.record, self.flags, self.chunk_idx, self.scalars = {}, None, None, {}
+        super().__init__(path)
         self._format = format_of(path)
         self.notes = unit_note(self._format)
         self._kept: IntArray | None = None
@@ -350,7 +438,7 @@ class MdanalysisReader(TrajectoryReader):
         if stated is not None and stated.n_atoms != self.n_atoms:
             self.close()
             raise InputError(f"{top} has {stated.n_atoms} atoms, {path} has {self.n_atoms}; give the matching one.")
-        self.scene = stated if stated is None or not self.n_frames else stated.with_positions(self._read(0, 1, 1)[0])
+        self.scene = None if stated is None else self._at_first_frame(stated)
 
     def _times(self) -> tuple[Float64Array, bool]:
         """Return times `(n_frames,)` ps and whether the file states them; frames without positions are left out.
@@ -384,11 +472,270 @@ class MdanalysisReader(TrajectoryReader):
         return np.asarray(cells, dtype=np.float64).reshape(-1, 3, 3) * _NM
 
     def _frames(self, start: int, stop: int, stride: int) -> Any:
-        if self._reader is None:
-            raise InputError(f"{self.path} is closed.")
         return (self._reader[k if self._kept is None else int(self._kept[k])] for k in range(start, stop, stride))
 
     def close(self) -> None:
+        super().close()
         if self._reader is not None:
             self._reader.close()
         self._reader = None
+
+
+# ---- H5MD of other programs -----------------------------------------------------------------------------------------
+
+
+class H5mdReader(TrajectoryReader):
+    """Reads the positions of an H5MD file's particles. Times without a unit are not known.
+
+    Raises TrajectoryError for a file that is damaged or states no unit of length, InputError for several groups of
+    particles or a `top` that does not fit.
+    """
+
+    def __init__(self, path: Path, top: Path | None) -> None:
+        super().__init__(path)
+        self._file = open_hdf5(path)
+        try:
+            with damage_reported(path):
+                self._read_headers()
+            stated = self._scene_of(top)
+            self.scene = None if stated is None else self._at_first_frame(stated)
+        except BaseException:
+            self._file.close()
+            raise
+
+    def _read_headers(self) -> None:
+        groups = [g for g in self._file.get("particles", {}).values() if "position/value" in g]
+        if not groups:
+            raise InputError(f"{self.path} holds no positions of particles.")
+        if len(groups) > 1:
+            names = ", ".join(g.name.rpartition("/")[2] for g in groups)
+            raise InputError(f"{self.path} holds several groups of particles ({names}); write one of them alone.")
+        self._box, position = groups[0].get("box"), groups[0]["position"]
+        self._value = position["value"]
+        if self._value.ndim != 3 or self._value.shape[2] != 3:
+            raise TrajectoryError(f"{self.path}: positions of shape {self._value.shape}, not (n, n_atoms, 3).")
+        self.n_frames, self.n_atoms = self._value.shape[:2]
+        nm = nm_per(self._value.attrs.get("unit", ""))
+        if nm is None:
+            raise TrajectoryError(
+                f"{self.path}: its positions state no unit of length that is known; set the attribute `unit` of "
+                f"{self._value.name} to 'nm' or 'Angstrom'."
+            )
+        self._nm = nm
+        self.time_ps, self.times_known = np.arange(self.n_frames, dtype=np.float64), False
+        time = position.get("time")
+        ps = None if time is None else ps_per(time.attrs.get("unit", ""))
+        if time is not None and ps is None:
+            self.notes = ("its times state no unit that is known and are not used.",)
+        elif time is not None and ps is not None:
+            steps: Any = time[()]
+            if np.ndim(steps) == 0:
+                steps = float(time.attrs.get("offset", 0.0)) + steps * np.arange(self.n_frames)
+            self.time_ps, self.times_known = ps * np.asarray(steps[: self.n_frames], dtype=np.float64), True
+            if len(self.time_ps) != self.n_frames:
+                raise TrajectoryError(f"{self.path} is damaged: {self.n_frames} frames, {len(self.time_ps)} times.")
+
+    def _read(self, start: int, stop: int, stride: int) -> Float32Array:
+        return self._rows(self._value, start, stop, stride).astype(np.float32) * np.float32(self._nm)
+
+    def _read_cells(self, start: int, stop: int, stride: int) -> Float64Array | None:
+        with damage_reported(self.path):
+            edges = None if self._box is None else self._box.get("edges", self._box.attrs.get("edges"))
+            if edges is None:
+                return None
+            column = edges.get("value") if isinstance(edges, h5py.Group) else None
+            if column is not None:
+                values, unit = self._rows(column, start, stop, stride), column.attrs.get("unit")
+            else:
+                one: npt.NDArray[Any] = np.asarray(edges[()])
+                values = np.broadcast_to(one, (len(range(start, stop, stride)), *one.shape))
+                unit = edges.attrs.get("unit") if isinstance(edges, h5py.Dataset) else None
+            nm = self._nm if unit is None else nm_per(unit)
+            if nm is None:
+                raise TrajectoryError(
+                    f"{self.path}: its cell is in {unit!r}, a unit that is not known; write it in nm."
+                )
+            cells = values[..., None] * np.eye(3) if values.ndim == 2 else values
+            return None if not np.any(cells) else np.asarray(cells, dtype=np.float64) * nm
+
+    def _rows(self, column: h5py.Dataset, start: int, stop: int, stride: int) -> npt.NDArray[Any]:
+        try:
+            rows: npt.NDArray[Any] = np.asarray(column[start:stop])[::stride]
+        except UNREADABLE as error:
+            raise TrajectoryError(
+                f"{self.path} is damaged in frames {start} to {stop} ({first_line(error)})."
+            ) from error
+        return rows
+
+    def close(self) -> None:
+        super().close()
+        self._file.close()
+
+
+# ---- XYZ ------------------------------------------------------------------------------------------------------------
+
+
+_FIELD = re.compile(r'(\w+)\s*=\s*(?:"([^"]*)"|\'([^\']*)\'|(\S+))')
+_SYMBOL_COLUMNS = ("species", "element", "symbols", "atom_types")
+
+
+class _Frame(NamedTuple):
+    names: list[str]
+    positions_nm: Float32Array
+    cell_nm: Float64Array | None
+
+
+class XyzReader(TrajectoryReader):
+    """Reads an XYZ file whole into memory; names or elements are the file's, bonds found by distance.
+
+    Frames whose atoms stand in another order are put into the first one's where names tell it. Raises TrajectoryError
+    for a damaged file or one of changing atoms, InputError for a `top` that does not fit.
+    """
+
+    def __init__(self, path: Path, top: Path | None) -> None:
+        super().__init__(path)
+        frames, moved = _frames(path)
+        if not frames:
+            raise TrajectoryError(f"{path} holds no frame.")
+        first, self.n_frames, self.n_atoms = frames[0], len(frames), len(frames[0].names)
+        self.time_ps, self.times_known = np.arange(self.n_frames, dtype=np.float64), False
+        self.notes = moved
+        self._positions = np.stack([f.positions_nm for f in frames])
+        cells = [f.cell_nm for f in frames if f.cell_nm is not None]
+        self._cells = np.stack(cells) if len(cells) == self.n_frames else None
+        stated = self._scene_of(top)
+        if stated is None:
+            self.scene = named_scene(path, first.names, _elements(first.names, path), first.positions_nm, first.cell_nm)
+        else:
+            self.scene = self._at_first_frame(stated)
+
+    def _read(self, start: int, stop: int, stride: int) -> Float32Array:
+        return self._positions[start:stop:stride].copy()
+
+    def _read_cells(self, start: int, stop: int, stride: int) -> Float64Array | None:
+        return None if self._cells is None else self._cells[start:stop:stride].copy()
+
+
+def _frames(path: Path) -> tuple[list[_Frame], tuple[str, ...]]:
+    frames: list[_Frame] = []
+    moved = {}
+    try:
+        with _open_text(path) as file:
+            for count in file:
+                if not count.strip():
+                    continue
+                n, comment = int(count), file.readline()
+                rows = [line.split() for line in itertools.islice(file, n)]
+                frame = _frame(rows, comment, n)
+                order = order_of(frame.names, frames[0].names, path, len(frames)) if frames else None
+                if order is not None:
+                    moved[len(frames)] = order
+                    frame = _Frame(frames[0].names, frame.positions_nm[order], frame.cell_nm)
+                frames.append(frame)
+    except (ValueError, IndexError, OSError, EOFError, zlib.error) as error:
+        raise TrajectoryError(f"{path} is damaged or cut short in frame {len(frames)} ({error}).") from error
+    return frames, _moved_note(moved)
+
+
+def _frame(rows: list[list[str]], comment: str, n_atoms: int) -> _Frame:
+    if len(rows) != n_atoms or not n_atoms:
+        raise ValueError(f"{len(rows)} of {n_atoms} atoms")
+    fields = {key: quoted or single or bare for key, quoted, single, bare in _FIELD.findall(comment)}
+    name_at, x_at = 0, 1
+    if "Properties" in fields:
+        parts, column, at = fields["Properties"].split(":"), 0, {}
+        for key, size in zip(parts[::3], parts[2::3], strict=True):
+            at[key.lower()] = column
+            column += int(size)
+        name_at = next((at[key] for key in _SYMBOL_COLUMNS if key in at), -1)
+        x_at = at.get("pos", -1)
+        if min(name_at, x_at) < 0:
+            raise ValueError("its Properties name no species or no pos")
+    positions = np.array([row[x_at : x_at + 3] for row in rows], dtype=np.float64) * _NM
+    if positions.shape != (n_atoms, 3):
+        raise ValueError("three coordinates are needed for each atom")
+    return _Frame([row[name_at] for row in rows], positions.astype(np.float32), _cell(fields))
+
+
+def _cell(fields: dict[str, str]) -> Float64Array | None:
+    """Return the box vectors `(3, 3)` nm, None where there is none or not all three directions are periodic."""
+    if "Lattice" not in fields or any(x.upper()[:1] != "T" for x in fields.get("pbc", "T T T").split()):
+        return None
+    cell = np.array(fields["Lattice"].split(), dtype=np.float64).reshape(3, 3) * _NM
+    return cell if abs(np.linalg.det(cell)) > 0.0 else None
+
+
+def _elements(names: list[str], path: Path) -> list[str]:
+    """Return elements of symbols or PDB names: CA in capitals is an alpha carbon, Ca calcium."""
+    out = []
+    for i, name in enumerate(names):
+        symbol = name.isalpha() and (len(name) == 1 or name[1:].islower() or name in ("CL", "BR"))
+        element = element_symbol(name, "UNK", name.capitalize() if symbol else "")
+        if element is None:
+            raise InputError(f"{path}: the element of atom {i} ({name}) is not known; give a PDB file with `top`.")
+        out.append(element)
+    return out
+
+
+# ---- ASE ------------------------------------------------------------------------------------------------------------
+
+
+class AseReader(TrajectoryReader):
+    """A file of ASE's `Trajectory`, read frame by frame; elements are the file's, bonds found by distance.
+
+    Raises TrajectoryError where ase is not installed or cannot read it, InputError for a `top` that does not fit.
+    """
+
+    def __init__(self, path: Path, top: Path | None) -> None:
+        super().__init__(path)
+        try:
+            from ase.io.trajectory import Trajectory
+        except ImportError as error:
+            raise TrajectoryError(
+                f"{path} is read by ase: `pip install ase`, or convert it elsewhere by `ase convert {path.name} "
+                f"{path.stem}.xyz`."
+            ) from error
+        try:
+            self._frames: Any = Trajectory(str(path))
+            self.n_frames = len(self._frames)
+            first = self._frames[0]
+        except Exception as error:  # ase raises whatever its parts do
+            raise TrajectoryError(f"{path} cannot be read by ase: {first_line(error)}.") from error
+        self.n_atoms = len(first)
+        self.time_ps, self.times_known = np.arange(self.n_frames, dtype=np.float64), False
+        self._elements = [str(x) for x in first.get_chemical_symbols()]
+        try:
+            stated = self._scene_of(top)
+        except InputError:
+            self.close()
+            raise
+        if stated is None:
+            cell = first.cell.array * _NM if first.pbc.all() else None
+            names = [f"{e}{k + 1}" for k, e in enumerate(self._elements)]
+            stated = named_scene(path, names, self._elements, first.positions * _NM, cell)
+        self.scene = self._at_first_frame(stated)
+
+    def _read(self, start: int, stop: int, stride: int) -> Float32Array:
+        out = np.empty((len(range(start, stop, stride)), self.n_atoms, 3), dtype=np.float32)
+        for k, frame in enumerate(self._stored(start, stop, stride)):
+            order_of(list(frame.get_chemical_symbols()), self._elements, self.path, start + k * stride)
+            out[k] = frame.positions * _NM
+        return out
+
+    def _read_cells(self, start: int, stop: int, stride: int) -> Float64Array | None:
+        frames = self._stored(start, stop, stride)
+        if not all(frame.pbc.all() for frame in frames):
+            return None
+        return np.array([frame.cell.array * _NM for frame in frames], dtype=np.float64).reshape(-1, 3, 3)
+
+    def _stored(self, start: int, stop: int, stride: int) -> list[Any]:
+        try:
+            return [self._frames[k] for k in range(start, stop, stride)]
+        except Exception as error:  # ase raises whatever its parts do
+            raise TrajectoryError(
+                f"{self.path} is damaged in frames {start} to {stop} ({first_line(error)})."
+            ) from error
+
+    def close(self) -> None:
+        super().close()
+        self._frames.close()

@@ -1,7 +1,7 @@
 """What other programs' files state, what their readers would make up, and scenes from the topologies that they hold.
 
-`FORMATS` is the table that the readers go by, and the manual prints it (`markdown`). What would be made up is not used:
-times are then unknown (`dt_ps`), atoms need `top`, and units that a file does not state are said in a line.
+`FORMATS` is the table that the readers go by. What would be made up is not used: times are then unknown (`dt_ps`),
+atoms need `top`, and units that a file does not state are said in a line.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from systems.chemistry.distance_bonds import with_bonds_by_distance
 from systems.chemistry.element_data import atomic_weight_da, element_symbol
 from systems.errors import InputError, TrajectoryError, first_line
 from systems.files.schema import parsed
-from systems.prepare.read.structure_text import read_structure
+from systems.prepare.structure_text import read_structure
 from systems.scene import Scene
 
 _NM = {"nanometer": 1.0, "nm": 1.0, "angstrom": 0.1, "a": 0.1, "å": 0.1, "bohr": 0.0529177210903, "pm": 1e-3}
@@ -52,88 +52,59 @@ EVERY, SOME, NONE = "stated", "where stated", "no"
 
 @dataclass(frozen=True)
 class Format:
-    """One format. `reader`: the library; `mda`: MDAnalysis' name of it, where the suffix does not say.
+    """One format, as the manual's table has it (docs/files.md), which also says what its library makes up.
 
-    `positions`, `times`, `cell`: EVERY, SOME or NONE, as files state them. `units`: of lengths, as the format fixes
-    them or files state them. `unit_taken`: the unit that is taken, with a line, where nothing states one. `names`:
-    what tells the atoms. `made_up`: what the library puts where a file says nothing. `streamed`: read block by block.
-    `tried`: the programs whose files it was tried with, empty where only the reader's own could be had.
+    `times`, `positions`: EVERY, SOME or NONE, as files state them. `names_atoms`: whether it needs no `top`.
+    `unit_taken`: the unit that is taken, with a line, where nothing states one. `streamed`: read block by block. `mda`:
+    MDAnalysis' name of it, where the suffix does not say.
     """
 
     name: str
     suffixes: tuple[str, ...]
     reader: str
     times: str
-    units: str
-    cell: str
-    names: str
-    made_up: str = ""
+    names_atoms: bool
     positions: str = EVERY
     unit_taken: str = ""
     streamed: bool = False
     mda: str | None = None
-    tried: str = ""
-
-    @property
-    def names_atoms(self) -> bool:
-        """Whether atoms are named in the file, so that it needs no `top`."""
-        return self.names != NONE
 
 
 XYZ_SUFFIXES = (".xyz", ".extxyz", ".xyz.gz", ".xyz.bz2", ".extxyz.gz")
-_ALL, _BONDS = "names, residues, elements", "names, residues, elements, bonds"
-_COUNTED = "times 0, 1, 2, ... ps"
-_STEP = "a time step of 1 ps"
-
 FORMATS = (
-    Format("surromd's and MDTraj's HDF5", (".h5", ".hdf5"), "surromd", SOME, "as stated", SOME, _BONDS, _COUNTED,
-           tried="MDTraj"),
-    Format("DCD", (".dcd",), "surromd", SOME, "Å", SOME, NONE, "times of 1 AKMA unit; LAMMPS counts in fs",
-           tried="CHARMM, NAMD, OpenMM, cpptraj"),
-    Format("XYZ, extended XYZ", XYZ_SUFFIXES, "surromd", NONE, "Å", SOME, "names or elements", _COUNTED,
-           tried="ASE, cpptraj"),
-    Format("ASE", (".traj",), "ase", NONE, "Å", SOME, "elements", _COUNTED, tried="ASE"),
-    Format("XTC", (".xtc",), "MDTraj", EVERY, "nm", SOME, NONE, streamed=True, tried="GROMACS, OpenMM, cpptraj"),
-    Format("TRR", (".trr",), "MDTraj", EVERY, "nm", SOME, NONE, "positions of frames that have only velocities",
-           positions=SOME, streamed=True, tried="GROMACS, cpptraj"),
-    Format("NetCDF (Amber)", (".nc", ".ncdf", ".netcdf"), "MDTraj", SOME, "as stated, else Å", SOME, NONE,
-           _COUNTED + "; Å and ps whatever is stated", streamed=True, tried="cpptraj"),
-    Format("PDB", (".pdb", ".pdb.gz"), "MDTraj", NONE, "Å", SOME, _BONDS, _COUNTED + "; the first model's atoms",
-           tried="OpenMM, cpptraj, the PDB's NMR ensembles"),
-    Format("PDBx/mmCIF", (".pdbx", ".cif", ".mmcif", ".pdbx.gz", ".cif.gz", ".mmcif.gz"), "MDTraj", NONE, "Å", SOME,
-           _BONDS, _COUNTED, tried="OpenMM, the PDB"),
-    Format("GRO", (".gro",), "MDTraj", SOME, "nm", EVERY, "names, residues", _COUNTED + "; the first frame's atoms",
-           tried="GROMACS"),
-    Format("MOL2", (".mol2",), "MDTraj", NONE, "Å", NONE, _BONDS, _COUNTED, tried="cpptraj"),
-    Format("Tinker ARC", (".arc",), "MDTraj", NONE, "Å", SOME, "names, bonds", _COUNTED + "; the first frame's atoms",
-           tried="Tinker"),
-    Format("Desmond", (".dtr", ".stk"), "MDTraj", EVERY, "Å", EVERY, NONE),
-    Format("Amber text", (".mdcrd", ".crd"), "MDTraj", NONE, "Å", SOME, NONE, _COUNTED, tried="cpptraj"),
-    Format("Amber restart", (".ncrst",), "MDTraj", SOME, "Å", SOME, NONE, tried="cpptraj"),
-    Format("Amber text restart", (".rst7", ".restrt", ".inpcrd"), "MDTraj", NONE, "Å", SOME, NONE, "a time of 0 ps",
-           tried="cpptraj, ParmEd"),
-    Format("LAMMPS text", (".lammpstrj",), "MDTraj", NONE, NONE, EVERY, NONE, _COUNTED + "; Å", unit_taken="Å",
-           tried="LAMMPS"),
-    Format("MSMBuilder LH5", (".lh5",), "MDTraj", NONE, "nm", NONE, _ALL, _COUNTED),
-    Format("HOOMD XML", (".hoomdxml",), "MDTraj", NONE, NONE, EVERY, "types, bonds",
-           _COUNTED + "; nm", unit_taken="nm", tried="HOOMD-blue"),
-    Format("OpenMM XML", (".xml",), "MDTraj", NONE, "nm", SOME, NONE, _COUNTED, tried="OpenMM"),
-    Format("H5MD", (".h5md",), "surromd", SOME, "as stated", SOME, NONE, _STEP, tried="pyh5md, MDAnalysis"),
-    Format("LAMMPS dump", (".lammpsdump", ".dump"), "MDAnalysis", NONE, NONE, EVERY, "elements", _STEP + "; Å",
-           unit_taken="Å", mda="LAMMPSDUMP", tried="LAMMPS"),
-    Format("TNG", (".tng",), "MDAnalysis", EVERY, "as stated", SOME, NONE, positions=SOME, tried="GROMACS"),
-    Format("GROMOS TRC", (".trc",), "MDAnalysis", EVERY, "nm", SOME, NONE, tried="GROMOS11"),
-    Format("TRZ", (".trz",), "MDAnalysis", EVERY, "nm", EVERY, NONE, tried="IBIsCO"),
-    Format("GSD", (".gsd",), "MDAnalysis", NONE, NONE, EVERY, "types, bonds", _STEP + "; Å", unit_taken="Å",
-           tried="HOOMD-blue"),
-    Format("DL_POLY", (".history",), "MDAnalysis", NONE, "Å", SOME, "names", _STEP, mda="HISTORY", tried="DL_POLY"),
-    Format("DL_POLY configuration", (".config",), "MDAnalysis", NONE, "Å", SOME, "names", _STEP, mda="CONFIG",
-           tried="DL_POLY"),
-    Format("Tinker XYZ", (".txyz",), "MDAnalysis", NONE, "Å", NONE, "names, bonds", _STEP, tried="Tinker"),
-    Format("PQR", (".pqr",), "MDAnalysis", NONE, "Å", NONE, "names, residues", _STEP, tried="PDB2PQR"),
-)  # fmt: skip
+    Format("surromd's and MDTraj's HDF5", (".h5", ".hdf5"), "surromd", SOME, True),
+    Format("DCD", (".dcd",), "surromd", SOME, False),
+    Format("XYZ, extended XYZ", XYZ_SUFFIXES, "surromd", NONE, True),
+    Format("ASE", (".traj",), "ase", NONE, True),
+    Format("XTC", (".xtc",), "MDTraj", EVERY, False, streamed=True),
+    Format("TRR", (".trr",), "MDTraj", EVERY, False, positions=SOME, streamed=True),
+    Format("NetCDF (Amber)", (".nc", ".ncdf", ".netcdf"), "MDTraj", SOME, False, streamed=True),
+    Format("PDB", (".pdb", ".pdb.gz"), "MDTraj", NONE, True),
+    Format("PDBx/mmCIF", (".pdbx", ".cif", ".mmcif", ".pdbx.gz", ".cif.gz", ".mmcif.gz"), "MDTraj", NONE, True),
+    Format("GRO", (".gro",), "MDTraj", SOME, True),
+    Format("MOL2", (".mol2",), "MDTraj", NONE, True),
+    Format("Tinker ARC", (".arc",), "MDTraj", NONE, True),
+    Format("Desmond", (".dtr", ".stk"), "MDTraj", EVERY, False),
+    Format("Amber text", (".mdcrd", ".crd"), "MDTraj", NONE, False),
+    Format("Amber restart", (".ncrst",), "MDTraj", SOME, False),
+    Format("Amber text restart", (".rst7", ".restrt", ".inpcrd"), "MDTraj", NONE, False),
+    Format("LAMMPS text", (".lammpstrj",), "MDTraj", NONE, False, unit_taken="Å"),
+    Format("MSMBuilder LH5", (".lh5",), "MDTraj", NONE, True),
+    Format("HOOMD XML", (".hoomdxml",), "MDTraj", NONE, True, unit_taken="nm"),
+    Format("OpenMM XML", (".xml",), "MDTraj", NONE, False),
+    Format("H5MD", (".h5md",), "surromd", SOME, False),
+    Format("LAMMPS dump", (".lammpsdump", ".dump"), "MDAnalysis", NONE, True, unit_taken="Å", mda="LAMMPSDUMP"),
+    Format("TNG", (".tng",), "MDAnalysis", EVERY, False, positions=SOME),
+    Format("GROMOS TRC", (".trc",), "MDAnalysis", EVERY, False),
+    Format("TRZ", (".trz",), "MDAnalysis", EVERY, False),
+    Format("GSD", (".gsd",), "MDAnalysis", NONE, True, unit_taken="Å"),
+    Format("DL_POLY", (".history",), "MDAnalysis", NONE, True, mda="HISTORY"),
+    Format("DL_POLY configuration", (".config",), "MDAnalysis", NONE, True, mda="CONFIG"),
+    Format("Tinker XYZ", (".txyz",), "MDAnalysis", NONE, True),
+    Format("PQR", (".pqr",), "MDAnalysis", NONE, True),
+)
 # Whatever else MDAnalysis reads: nothing is believed beyond positions.
-OTHER = Format("any other", (), "MDAnalysis", NONE, "as MDAnalysis reads them", SOME, NONE, _STEP, tried="none")
+OTHER = Format("any other", (), "MDAnalysis", NONE, False)
 
 
 def format_of(path: Path) -> Format:
@@ -141,28 +112,6 @@ def format_of(path: Path) -> Format:
     of the table has it."""
     name = "." + path.name.lower()
     return next((f for f in FORMATS if name.endswith(f.suffixes)), OTHER)
-
-
-def markdown() -> str:
-    """Return the table as the manual prints it."""
-    head = (
-        "format",
-        "read by",
-        "positions",
-        "times",
-        "unit of length",
-        "cell",
-        "atoms",
-        "made up, not used",
-        "tried with files of",
-    )
-    rows = [
-        (f"{f.name} ({', '.join(f'`{s}`' for s in f.suffixes)})" if f.suffixes else f.name, f.reader, f.positions,
-         f.times, f"{f.units}; {f.unit_taken} taken, with a line" if f.unit_taken else f.units, f.cell, f.names,
-         f.made_up or "nothing", f.tried or f"{f.reader} alone")
-        for f in (*FORMATS, OTHER)
-    ]  # fmt: skip
-    return "\n".join("| " + " | ".join(cells) + " |" for cells in (head, ("---",) * len(head), *rows))
 
 
 # ---- scenes from topologies -----------------------------------------------------------------------------------------
@@ -189,7 +138,8 @@ def scene_from_mdtraj_topology(
         raise InputError(f"{source or name}: {topology.n_atoms} atoms in the topology, positions {positions.shape}.")
     atoms, residues = list(topology.atoms), list(topology.residues)
     rows = sorted(
-        (min(b.atom1.index, b.atom2.index), max(b.atom1.index, b.atom2.index), _order(b)) for b in topology.bonds
+        (min(b.atom1.index, b.atom2.index), max(b.atom1.index, b.atom2.index), float(b.order or b.type or 0))
+        for b in topology.bonds
     )
     symbols = list(elements) if elements is not None else [a.element.symbol if a.element else "VS" for a in atoms]
     bonds = np.array([row[:2] for row in rows], dtype=np.int64).reshape(-1, 2)
@@ -208,7 +158,7 @@ def scene_from_mdtraj_topology(
         residue_of_atom=np.array([a.residue.index for a in atoms], dtype=np.int64),
         residue_names=tuple(r.name for r in residues),
         residue_ids=tuple(map(str, numbers)),
-        chain_of_residue=tuple(_chain_id(r.chain) for r in residues),
+        chain_of_residue=tuple(str(r.chain.chain_id or chr(ord("A") + r.chain.index % 26)) for r in residues),
         bonds=bonds,
         bond_orders=orders,
         formal_charges=charges,
@@ -255,10 +205,11 @@ def scene_from_structure(top: Path, *, name: str) -> Scene:
     import mdtraj
 
     if not is_mdtraj_format(top) or top.suffix.lower() in (".xyz", ".gsd"):
-        topology = _bare_topology(top)
-        if topology is None:
-            return scene_from_universe(top, name=name)
-        return scene_from_mdtraj_topology(topology, np.zeros((topology.n_atoms, 3)), name=name, source=top.name)
+        if top.suffix.lower() in (".psf", ".prmtop", ".parm7", ".top"):
+            with contextlib.suppress(Exception):  # MDAnalysis is asked next, and says what is wrong
+                bare = mdtraj.load_topology(str(top))
+                return scene_from_mdtraj_topology(bare, np.zeros((bare.n_atoms, 3)), name=name, source=top.name)
+        return scene_from_universe(top, name=name)
     try:
         structure = mdtraj.load(str(top))
     except Exception as error:  # each MDTraj reader raises its own kinds
@@ -329,17 +280,6 @@ def scene_from_universe(top: Path, *, name: str) -> Scene:
     return with_orders(with_bonds_by_distance(scene))
 
 
-def _bare_topology(top: Path) -> Any:
-    """Return MDTraj's topology of a file without positions (PSF, prmtop), None when MDTraj does not read it."""
-    import mdtraj
-
-    if top.suffix.lower() not in (".psf", ".prmtop", ".parm7", ".top"):
-        return None
-    with contextlib.suppress(Exception):  # MDAnalysis is asked next, and says what is wrong
-        return mdtraj.load_topology(str(top))
-    return None
-
-
 def is_mdtraj_format(path: Path) -> bool:
     """Whether MDTraj has a reader for files of this suffix that needs no topology of the caller's beyond `top`."""
     from mdtraj.formats.registry import FormatRegistry
@@ -382,17 +322,6 @@ def _mass_da(symbol: str, atom: Any) -> float:
         return atomic_weight_da(symbol)
     except KeyError:  # an element without a table entry, or a virtual site
         return float(atom.element.mass) if atom.element is not None else 0.0
-
-
-def _order(bond: Any) -> float:
-    if bond.order is not None:
-        return float(bond.order)
-    return 0.0 if bond.type is None else float(bond.type)
-
-
-def _chain_id(chain: Any) -> str:
-    given = getattr(chain, "chain_id", None)
-    return str(given) if given else chr(ord("A") + chain.index % 26)
 
 
 def bonds_completed(scene: Scene, cells_nm: npt.NDArray[np.float64] | None) -> Scene:

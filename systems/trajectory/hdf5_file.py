@@ -1,4 +1,4 @@
-"""HDF5 trajectories that follow MDTraj's and H5MD's conventions at once, written and read by h5py alone; others' H5MD.
+"""HDF5 trajectories that follow MDTraj's and H5MD's conventions at once, written and read by h5py alone.
 
 MDTraj: `/coordinates` (n, n_atoms, 3) float32 nm, `/time` ps, `/topology` JSON (mdtraj.org, HDF5 format, version 1.1).
 H5MD 1.1 (de Buyl, Colberg and Höfling, Comput. Phys. Commun. 185, 1546 (2014)): `/particles/trajectory/position` with
@@ -20,35 +20,36 @@ import h5py
 import numpy as np
 import numpy.typing as npt
 
-from systems.chemistry.cell import lengths_and_angles
-from systems.chemistry.cell import read_cells as cells_of
+from systems.chemistry.distance_bonds import lengths_and_angles
+from systems.chemistry.distance_bonds import read_cells as cells_of
 from systems.errors import InputError, TrajectoryError, first_line
 from systems.files.outside import UNREADABLE
-from systems.files.whole_file import Checksums, check_frames_read, frame_checksums, refuse_existing
+from systems.files.whole_file import refuse_existing
 from systems.scene import ATOMIC_NUMBERS, Scene
-from systems.trajectory.base import TrajectoryReader, TrajectoryWriter, check_same_topology, unused_top_note
-from systems.trajectory.companion_writer import refuse_other_topology, topology_bytes, topology_path, write_topology
-from systems.trajectory.foreign_readers import counted_note
-from systems.trajectory.foreign_scenes import nm_per, ps_per, scene_from_structure
-from systems.trajectory.frame_store import (
+from systems.trajectory.base import (
     CELLS,
-    CHECKSUMS,
     EDGES,
     FRAMES,
     Float32Array,
     Float64Array,
     FrameBlock,
-    FrameStore,
+    TrajectoryReader,
+    TrajectoryWriter,
     add_column,
-    columns_with_frames,
-    consistent_length,
     create_store,
     damage_reported,
-    get_json,
     open_hdf5,
     program_version,
-    read_record,
-    read_run_id,
+    unused_top_note,
+)
+from systems.trajectory.companion_writer import refuse_other_topology, topology_bytes, topology_path, write_topology
+from systems.trajectory.foreign_readers import counted_note
+from systems.trajectory.foreign_scenes import (
+    bonds_completed,
+    nm_per,
+    ps_per,
+    scene_from_structure,
+    scene_from_topology_json,
 )
 
 PER_ATOM = ("velocities", "forces")
@@ -58,13 +59,6 @@ _LAYOUT = {
     "forces": ("force", b"kilojoules_per_mole/nanometer", "kJ mol-1 nm-1"),
 }
 _POSITION = "particles/trajectory/position"
-
-
-def check_wanted(wanted: Sequence[str], path: Path) -> None:
-    """Raise InputError for a column that a file cannot have."""
-    for name in wanted:
-        if name not in PER_ATOM:
-            raise InputError(f"{path}: no column {name!r} can be stored; known: {', '.join(PER_ATOM)}.")
 
 
 def lay_out_extras(file: h5py.File, wanted: Sequence[str], *, periodic: bool) -> None:
@@ -147,8 +141,6 @@ class Hdf5Writer(TrajectoryWriter):
         columns: Sequence[str] = (),
         run_id: str = "",
     ) -> None:
-        self.path, self.scene = path, scene
-        check_wanted(columns, path)
         topology = b"" if append and topology_path(path).exists() else topology_bytes(scene)
         if not append:
             refuse_existing(path, overwrite)
@@ -163,37 +155,29 @@ class Hdf5Writer(TrajectoryWriter):
                 run_id=run_id,
                 checksums=names,
             )
-        self._store = FrameStore(path)
+        super().__init__(path, path, scene, record, append=append)
         try:
-            check_same_topology(path, self._store.scene, scene)
-            if "coordinates" not in self._store.file:
-                raise TrajectoryError(f"{path} holds no coordinates; it is the companion of a DCD file.")
             write_topology(path, topology)
-            new = {key: value for key, value in record.items() if key not in self._store.record}
-            if append and new:
-                self._store.update_record(new)
         except BaseException:
-            self._store.close()
+            self.close()
             raise
-        self.n_frames, self.last_time_ps = self._store.n_frames, self._store.last_time_ps
+
+    def _adopt(self) -> None:
+        if "coordinates" not in self.file:
+            raise TrajectoryError(f"{self.path} holds no coordinates; it is the companion of a DCD file.")
 
     def _append(self, block: FrameBlock) -> None:
-        self._refuse_closed()
-        timestep_ps = self._store.record.get("timestep_ps")
+        timestep_ps = self.record.get("timestep_ps")
         if isinstance(timestep_ps, int | float) and timestep_ps > 0:
             step = np.rint(block.time_ps / timestep_ps).astype(np.int64)
         else:
             step = np.arange(self.n_frames, self.n_frames + len(block), dtype=np.int64)
-        extra = extra_values(self._store.file, block, self.scene.cell_nm, f"{self.path}, after frame {self.n_frames}")
+        with self._open():
+            extra = extra_values(self.file, block, self.scene.cell_nm, f"{self.path}, after frame {self.n_frames}")
         stored = {FRAMES: block.positions_nm, **{name: extra[name] for name in PER_ATOM if name in extra}}
         if EDGES in extra:
             stored[CELLS] = extra[EDGES]
-        self._store.append(block, {"coordinates": block.positions_nm, f"{_POSITION}/step": step, **extra}, stored)
-
-    def truncate(self, n_frames: int) -> None:
-        self._refuse_closed()
-        self._store.truncate(n_frames)
-        self.n_frames, self.last_time_ps = n_frames, self._store.last_time_ps
+        self._store(block, {"coordinates": block.positions_nm, f"{_POSITION}/step": step, **extra}, stored)
 
 
 class Hdf5Reader(TrajectoryReader):
@@ -203,7 +187,7 @@ class Hdf5Reader(TrajectoryReader):
     """
 
     def __init__(self, path: Path, top: Path | None = None) -> None:
-        self.path = path
+        super().__init__(path)
         self._file = open_hdf5(path)
         try:
             with damage_reported(path):
@@ -215,31 +199,26 @@ class Hdf5Reader(TrajectoryReader):
     def _read_headers(self, top: Path | None) -> None:
         if "coordinates" not in self._file:
             raise TrajectoryError(f"{self.path} holds no /coordinates: it is not an MDTraj or surromd trajectory.")
-        self.n_frames = consistent_length(self._file, self.path)
+        self._read_stored(self._file, self.path)
         self._coordinates = self._file["coordinates"]
         if self._coordinates.ndim != 3 or self._coordinates.shape[2] != 3:
             raise TrajectoryError(f"{self.path}: /coordinates of shape {self._coordinates.shape}, not (n, n_atoms, 3).")
         self._scale = _per_unit(self._file, "coordinates", nm_per, self.path)
         self.n_atoms = int(self._coordinates.shape[1])
-        columns = read_columns(self._file, self.path, self.n_frames)
-        self.time_ps, self.flags, self.chunk_idx, self.scalars = columns
-        self.checksums, self.run_id = read_checksums(self._file, self.n_frames), read_run_id(self._file)
-        self.times_known = "surromd" in self._file or "time" in self._file
-        self.record = read_record(self._file) if "surromd" in self._file else {}
-        if "surromd" not in self._file and "time" in self._file:
+        self._is_ours = "surromd" in self._file
+        self.times_known = self._is_ours or "time" in self._file
+        if not self._is_ours and "time" in self._file:
             self.time_ps = self.time_ps * _per_unit(self._file, "time", ps_per, self.path)
             self.notes = counted_note(self.time_ps)
-        self.scene = self._read_scene(top)
+        unused = () if top is None else (unused_top_note(top),)
+        if self._is_ours:
+            self.notes += unused
+        else:
+            self.scene = self._foreign_scene(top, unused)
         if self.scene is not None and self.scene.n_atoms != self.n_atoms:
             raise TrajectoryError(f"{self.path}: {self.n_atoms} atoms a frame, but {self.scene.n_atoms} in its scene.")
 
-    def _read_scene(self, top: Path | None) -> Scene | None:
-        unused = () if top is None else (unused_top_note(top),)
-        if "surromd" in self._file:
-            self.notes += unused
-            return Scene.from_dict(get_json(self._file, "surromd/scene"))
-        from systems.trajectory.foreign_scenes import bonds_completed, scene_from_structure, scene_from_topology_json
-
+    def _foreign_scene(self, top: Path | None, unused: tuple[str, ...]) -> Scene | None:
         own = None
         if "topology" in self._file and self.n_frames:
             own = scene_from_topology_json(self._file["topology"][0], self._read(0, 1, 1)[0], self.path)
@@ -247,7 +226,7 @@ class Hdf5Reader(TrajectoryReader):
             stated = scene_from_structure(top, name=self.path.stem)
             if stated.n_atoms != self.n_atoms or (own is not None and stated.elements != own.elements):
                 raise InputError(f"{top} holds other atoms than {self.path} ({self.n_atoms}); give the matching one.")
-            return stated.with_positions(self._read(0, 1, 1)[0]) if self.n_frames else stated
+            return self._at_first_frame(stated)
         if own is None:
             return None
         self.notes += unused
@@ -259,27 +238,23 @@ class Hdf5Reader(TrajectoryReader):
 
     def _read(self, start: int, stop: int, stride: int) -> Float32Array:
         frames = self._gather(self._coordinates, start, stop, stride)
-        check_read(self, FRAMES, frames, slice(start, stop, stride))
+        self._check_read(FRAMES, frames, slice(start, stop, stride))
         return frames if self._scale == 1.0 else (frames * np.float32(self._scale))
 
     def _read_extra(self, name: str, start: int, stop: int, stride: int) -> Float32Array | None:
-        if not self._file:
-            raise InputError(f"{self.path} is closed.")
         if name not in self._file:
             return None
         values = self._gather(self._file[name], start, stop, stride)
-        check_read(self, name, values, slice(start, stop, stride))
+        self._check_read(name, values, slice(start, stop, stride))
         return values
 
     def _read_cells(self, start: int, stop: int, stride: int) -> Float64Array | None:
-        if not self._file:
-            raise InputError(f"{self.path} is closed.")
         with damage_reported(self.path):
             cells = read_cells(self._file, start, stop, stride)
-            if cells is not None and "surromd" not in self._file and "cell_lengths" in self._file:
+            if cells is not None and not self._is_ours and "cell_lengths" in self._file:
                 cells *= _per_unit(self._file, "cell_lengths", nm_per, self.path)
         if cells is not None:
-            check_read(self, CELLS, cells, slice(start, stop, stride))
+            self._check_read(CELLS, cells, slice(start, stop, stride))
         return cells
 
     def _gather(self, column: h5py.Dataset, start: int, stop: int, stride: int) -> Float32Array:
@@ -293,13 +268,12 @@ class Hdf5Reader(TrajectoryReader):
             parts = [column[s : min(s + block, stop)][::stride] for s in range(start, stop, block)]
             return np.concatenate(parts).astype(np.float32, copy=False)
         except UNREADABLE as error:
-            if not self._file:
-                raise InputError(f"{self.path} is closed.") from error
             raise TrajectoryError(
                 f"{self.path} is damaged in frames {start} to {stop} ({first_line(error)})."
             ) from error
 
     def close(self) -> None:
+        super().close()
         self._file.close()
 
 
@@ -310,42 +284,6 @@ def is_plain_h5md(path: Path) -> bool:
             return "h5md" in file and "coordinates" not in file and "surromd" not in file
     except TrajectoryError:  # its own reader says how it is damaged
         return False
-
-
-def read_columns(file: h5py.File, path: Path, n_frames: int) -> tuple[Any, Any, Any, dict[str, Any]]:
-    """Return `(time_ps, flags, chunk_idx, scalars)` of the first `n_frames` frames; None for what is not there."""
-    if "surromd" in file or "time" in file:
-        time_ps = file["time"][:n_frames].astype(np.float64)
-    else:
-        time_ps = np.arange(n_frames, dtype=np.float64)
-    flags = file["surromd/flags"][:n_frames] if "surromd/flags" in file else None
-    chunk_idx = file["surromd/chunk_idx"][:n_frames] if "surromd/chunk_idx" in file else None
-    group = file.get("surromd/scalars", {})
-    scalars = {name: group[name][:n_frames] for name in group}
-    if not np.isfinite(time_ps).all():
-        raise TrajectoryError(f"{path} is damaged: some frames have no time.")
-    return time_ps, flags, chunk_idx, scalars
-
-
-def read_checksums(file: h5py.File, n_frames: int) -> dict[str, Checksums]:
-    """Return the checksums `(n_frames,)` of the first frames by what they are of; older files have none."""
-    return {name: column[:n_frames] for name, column in file.get(CHECKSUMS, {}).items()}
-
-
-def check_read(reader: TrajectoryReader, name: str, stored: npt.NDArray[Any], frames: slice) -> None:
-    """Raise TrajectoryError unless what was read of `frames`, as it is on disk, is what was written.
-
-    With positions (FRAMES) go what the reader holds of the same frames: times, chunks, flags, scalars.
-    """
-    if name not in reader.checksums or not len(stored):
-        return
-    columns = {name: stored}
-    if name == FRAMES and reader.chunk_idx is not None:
-        flags = None if reader.flags is None else reader.flags[frames]
-        scalars = {key: values[frames] for key, values in reader.scalars.items()}
-        columns |= columns_with_frames(reader.time_ps[frames], reader.chunk_idx[frames], flags, scalars)
-    found = frame_checksums(columns)
-    check_frames_read(reader.path, reader.checksums[name][frames], found, frames.start, frames.step)
 
 
 def _per_unit(file: h5py.File, name: str, per: Callable[[Any], float | None], path: Path) -> float:
@@ -417,104 +355,3 @@ def _topology_json(scene: Scene) -> str:
     orders = scene.bond_orders.tolist()
     metadata = [{"order": order or None, "type": _BOND_TYPES.get(order)} for order in orders]
     return json.dumps({"chains": chains, "bonds": scene.bonds.tolist(), "bond_metadata": metadata})
-
-
-# ---- H5MD of other programs -----------------------------------------------------------------------------------------
-
-
-class H5mdReader(TrajectoryReader):
-    """Reads the positions of an H5MD file's particles. Times without a unit are not known.
-
-    Raises TrajectoryError for a file that is damaged or states no unit of length, InputError for several groups of
-    particles or a `top` that does not fit.
-    """
-
-    def __init__(self, path: Path, top: Path | None) -> None:
-        self.path = path
-        self.record, self.flags, self.chunk_idx, self.scalars = {}, None, None, {}
-        self._file = open_hdf5(path)
-        try:
-            with damage_reported(path):
-                self._read_headers()
-            self.scene = None if top is None else scene_from_structure(top, name=path.stem)
-            if self.scene is not None:
-                if self.scene.n_atoms != self.n_atoms:
-                    raise InputError(
-                        f"{top} has {self.scene.n_atoms} atoms, {path} has {self.n_atoms}; give the matching one."
-                    )
-                if self.n_frames:
-                    self.scene = self.scene.with_positions(self._read(0, 1, 1)[0])
-        except BaseException:
-            self._file.close()
-            raise
-
-    def _read_headers(self) -> None:
-        groups = [g for g in self._file.get("particles", {}).values() if "position/value" in g]
-        if not groups:
-            raise InputError(f"{self.path} holds no positions of particles.")
-        if len(groups) > 1:
-            names = ", ".join(g.name.rpartition("/")[2] for g in groups)
-            raise InputError(f"{self.path} holds several groups of particles ({names}); write one of them alone.")
-        self._box, position = groups[0].get("box"), groups[0]["position"]
-        self._value = position["value"]
-        if self._value.ndim != 3 or self._value.shape[2] != 3:
-            raise TrajectoryError(f"{self.path}: positions of shape {self._value.shape}, not (n, n_atoms, 3).")
-        self.n_frames, self.n_atoms = self._value.shape[:2]
-        nm = nm_per(self._value.attrs.get("unit", ""))
-        if nm is None:
-            raise TrajectoryError(
-                f"{self.path}: its positions state no unit of length that is known; set the attribute `unit` of "
-                f"{self._value.name} to 'nm' or 'Angstrom'."
-            )
-        self._nm = nm
-        self.time_ps, self.times_known = np.arange(self.n_frames, dtype=np.float64), False
-        time = position.get("time")
-        ps = None if time is None else ps_per(time.attrs.get("unit", ""))
-        if time is not None and ps is None:
-            self.notes = ("its times state no unit that is known and are not used.",)
-        elif time is not None and ps is not None:
-            steps: Any = time[()]
-            if np.ndim(steps) == 0:
-                steps = float(time.attrs.get("offset", 0.0)) + steps * np.arange(self.n_frames)
-            self.time_ps, self.times_known = ps * np.asarray(steps[: self.n_frames], dtype=np.float64), True
-            if len(self.time_ps) != self.n_frames:
-                raise TrajectoryError(f"{self.path} is damaged: {self.n_frames} frames, {len(self.time_ps)} times.")
-
-    def _read(self, start: int, stop: int, stride: int) -> Float32Array:
-        return self._rows(self._value, start, stop, stride).astype(np.float32) * np.float32(self._nm)
-
-    def _read_cells(self, start: int, stop: int, stride: int) -> Float64Array | None:
-        if not self._file:
-            raise InputError(f"{self.path} is closed.")
-        with damage_reported(self.path):
-            edges = None if self._box is None else self._box.get("edges", self._box.attrs.get("edges"))
-            if edges is None:
-                return None
-            column = edges.get("value") if isinstance(edges, h5py.Group) else None
-            if column is not None:
-                values, unit = self._rows(column, start, stop, stride), column.attrs.get("unit")
-            else:
-                one: npt.NDArray[Any] = np.asarray(edges[()])
-                values = np.broadcast_to(one, (len(range(start, stop, stride)), *one.shape))
-                unit = edges.attrs.get("unit") if isinstance(edges, h5py.Dataset) else None
-            nm = self._nm if unit is None else nm_per(unit)
-            if nm is None:
-                raise TrajectoryError(
-                    f"{self.path}: its cell is in {unit!r}, a unit that is not known; write it in nm."
-                )
-            cells = values[..., None] * np.eye(3) if values.ndim == 2 else values
-            return None if not np.any(cells) else np.asarray(cells, dtype=np.float64) * nm
-
-    def _rows(self, column: h5py.Dataset, start: int, stop: int, stride: int) -> npt.NDArray[Any]:
-        try:
-            rows: npt.NDArray[Any] = np.asarray(column[start:stop])[::stride]
-        except UNREADABLE as error:
-            if not self._file:
-                raise InputError(f"{self.path} is closed.") from error
-            raise TrajectoryError(
-                f"{self.path} is damaged in frames {start} to {stop} ({first_line(error)})."
-            ) from error
-        return rows
-
-    def close(self) -> None:
-        self._file.close()

@@ -36,8 +36,8 @@ def test_systems_shows_a_scene_with_its_protocols_or_its_own_settings(name: str,
     for word in words:
         assert word in printed
     described = json.loads(run("systems", name, "--json").stdout)[0]
-    assert list(described["protocols"]) == list(named_scenes.protocols(name))
-    assert described.get("settings", {}) == named_scenes.own_settings(name)
+    assert list(described["protocols"]) == list(named_scenes.entry(name).protocols)
+    assert described.get("settings", {}) == named_scenes.entry(name).own_settings
 
 
 def test_plan_takes_the_protocol_and_says_so() -> None:

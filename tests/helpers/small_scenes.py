@@ -87,6 +87,6 @@ def n_unpaired_electrons(scene: Scene) -> int:
 
     Raises PreparationError where the bond orders are not known.
     """
-    from systems.prepare.molecule import to_rdkit
+    from rdkit_of_scene import to_rdkit
 
     return sum(atom.GetNumRadicalElectrons() for atom in to_rdkit(scene).GetAtoms())

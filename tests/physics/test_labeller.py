@@ -12,8 +12,8 @@ import pytest
 
 from md_reference.forces.quantum import Potential, refuse_rearranged
 from md_reference.run.labeller import Labeller
-from systems.chemistry.geometry_rules import changed_stereo
 from systems.chemistry.graph import bonded_graph, turned
+from systems.chemistry.validity import changed_stereo
 from systems.errors import PreparationError
 from systems.prepare.molecule import scene_from_smiles
 from systems.scene import FloatArray, Scene

@@ -100,8 +100,9 @@ def run_case(case: Case, *, time_ps: float, timestep_ps: float, force_field: str
 
 def what_is_wrong(scene: Scene, positions_nm: np.ndarray) -> str:
     """Return what a frame `(n_atoms, 3)` nm of the scene's run has lost of its molecule, or an empty string."""
-    from systems.prepare.molecule import to_rdkit
-    from systems.prepare.read.smiles import stereo_labels
+    from rdkit_of_scene import to_rdkit
+
+    from systems.prepare.molecule import stereo_labels
 
     if not np.isfinite(positions_nm).all():
         return "positions are not finite"

@@ -66,7 +66,7 @@ def run_scene(name: str, folder: Path, *, time_ps: float = 10.0) -> Outcome:
     began = time.perf_counter()
     try:
         scene = named_scenes.load(name)
-        settings, _ = resolve_settings(scene, {}, next(iter(named_scenes.protocols(name)), None))
+        settings, _ = resolve_settings(scene, {}, next(iter(named_scenes.entry(name).protocols), None))
         settings |= {
             "time_ps": time_ps,
             "equilibrate_ps": min(settings["equilibrate_ps"], 10.0 / settings["friction_per_ps"]),

@@ -51,7 +51,7 @@ def campaign_text(time_ps: float) -> str:
     tables = []
     for name in SCENES:
         # A scene's own protocol outweighs what the campaign says.
-        own = [f'protocol = "{one}", {both}, save_every = "20fs"' for one in named_scenes.protocols(name)]
+        own = [f'protocol = "{one}", {both}, save_every = "20fs"' for one in named_scenes.entry(name).protocols]
         tables.append("{ " + ", ".join([f'scene = "{name}"', *own]) + " }")
     return (
         f"scenes = [{', '.join(tables)}]\n"

@@ -27,7 +27,7 @@ from md_reference.run.simulate import simulate
 from md_reference.simd.force_field import n_replicas
 from systems.library.named_scenes import prepare
 from systems.scene import Scene
-from systems.units import parse_length_nm, parse_time_ps
+from systems.units import parse_time_ps, quantity
 
 SPEC = ForceFieldSpec("ff14SB", "tip3p")
 VOLUME_PS, DISCARDED = 500.0, 0.2
@@ -64,7 +64,7 @@ def main() -> None:
         path.write_text(json.dumps(at_one_bar(solvate(dry, SPEC, WaterBox()), seed=1).to_dict()))
         return
     if args.padding:
-        scene = solvate(dry, SPEC, WaterBox(padding_nm=parse_length_nm(args.padding)))
+        scene = solvate(dry, SPEC, WaterBox(padding_nm=quantity("padding_nm", args.padding)))
     else:
         scene = Scene.from_dict(json.loads(path.read_text()))
     config = MDConfig(force=SPEC, time_ps=parse_time_ps(args.time), keep="solute", platform=args.what)

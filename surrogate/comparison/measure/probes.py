@@ -442,8 +442,8 @@ def triplet_label(scene: Scene, triplet: npt.ArrayLike) -> str:
 
 def find_rings(scene: Scene) -> tuple[tuple[int, ...], ...]:
     """Return the rings of 4 to 7 atoms, in order, that hold an atom with four neighbours: those that can pucker."""
-    from systems.chemistry.geometry_rules import small_rings
     from systems.chemistry.graph import bonded_graph
+    from systems.chemistry.validity import small_rings
 
     graph = bonded_graph(scene)
     # Without hydrogens, valence does not show in the graph; a flat ring is then found by its amplitude.

@@ -40,10 +40,9 @@ from surrogate.models.peptides.torsion_states import (
     StatedTorsions,
 )
 from systems.chemistry.geometry import torsion
-from systems.chemistry.geometry_rules import CLASH_AT_MOST_NM
-from systems.chemistry.graph import backbone_torsions, bonded_graph, exclusions, ring_bonds
-from systems.chemistry.matching import match_atoms
+from systems.chemistry.graph import backbone_torsions, bonded_graph, exclusions, match_atoms, ring_bonds
 from systems.chemistry.residues import template_for
+from systems.chemistry.validity import CLASH_AT_MOST_NM
 from systems.errors import InputError, OutOfDomainError, PreparationError
 from systems.prepare.peptide import build_peptide
 from systems.scene import Scene

@@ -113,7 +113,7 @@ def _smiles(path: Path) -> list[tuple[str, str]]:
 
 def _unreadable(specs: Sequence[SceneSpec]) -> dict[str, str]:
     """Return why, by name, of those that are given as SMILES and are none."""
-    from systems.prepare.read.smiles import parse_smiles
+    from systems.prepare.molecule import parse_smiles
 
     found = {}
     for spec in specs:

@@ -9,10 +9,6 @@ from hypothesis import strategies as st
 from systems.errors import InputError, UnitError
 from systems.units import (
     format_time_ps,
-    parse_mass_da,
-    parse_rate_per_ps,
-    parse_temperature_k,
-    parse_time_or_none_ps,
     parse_time_ps,
     parse_wall_s,
     quantity,
@@ -88,13 +84,13 @@ def test_wall_time_and_simulated_time_do_not_mix() -> None:
 
 
 def test_temperature_friction_and_mass() -> None:
-    assert parse_temperature_k("300K") == parse_temperature_k("300") == parse_temperature_k("300 K") == 300.0
-    assert parse_rate_per_ps("91/ps") == parse_rate_per_ps("91") == parse_rate_per_ps("91 1/ps") == 91.0
-    assert parse_rate_per_ps("0.1/fs") == pytest.approx(100.0)
-    assert parse_mass_da("3Da") == parse_mass_da("3") == parse_mass_da("3 amu") == 3.0
-    for parse, text in ((parse_temperature_k, "25C"), (parse_rate_per_ps, "1ps"), (parse_mass_da, "3kg")):
+    assert {quantity("bath_k", text) for text in ("300K", "300", "300 K")} == {300.0}
+    assert {quantity("friction_per_ps", text) for text in ("91/ps", "91", "91 1/ps")} == {91.0}
+    assert quantity("friction_per_ps", "0.1/fs") == pytest.approx(100.0)
+    assert {quantity("mass_da", text) for text in ("3Da", "3", "3 amu")} == {3.0}
+    for name, text in (("bath_k", "25C"), ("friction_per_ps", "1ps"), ("mass_da", "3kg")):
         with pytest.raises(UnitError, match="unknown unit"):
-            parse(text)
+            quantity(name, text)
 
 
 @given(st.floats(min_value=1e-3, max_value=1e9, allow_nan=False))
@@ -148,7 +144,7 @@ def test_a_quantity_is_a_number_or_a_text_with_its_unit(name: str, value: float 
 @pytest.mark.parametrize(("text", "said"), [("-1ps", "not negative"), ("0", "no unit"), ("0 parsecs", "unknown unit")])
 def test_only_what_has_a_unit_is_none_at_all(text: str, said: str) -> None:
     with pytest.raises(UnitError, match=f"--equilibrate .*{said}"):
-        parse_time_or_none_ps(text, "--equilibrate")
+        quantity("equilibrate_ps", text, "--equilibrate")
 
 
 @pytest.mark.parametrize("value", ["10", "soon", -1.0, float("nan"), float("inf"), True, [1.0], b"10ns"])

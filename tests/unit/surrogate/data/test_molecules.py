@@ -11,7 +11,6 @@ import pytest
 
 from surrogate.data.frames import collect_frames, in_standard_pose
 from surrogate.data.references import FrameSets, collect_sets
-from systems.chemistry.symmetry import local_handedness
 from systems.errors import InputError
 from systems.prepare.molecule import scene_from_smiles
 from systems.scene import Scene
@@ -90,11 +89,3 @@ def test_the_standard_pose_follows_the_molecule(write: Write) -> None:
     apart = lambda x: np.linalg.norm(x[:, :, None] - x[:, None], axis=-1)  # noqa: E731
     np.testing.assert_allclose(apart(posed.positions_nm(idx)), apart(plain.positions_nm(idx)), rtol=0, atol=1e-6)
     assert isinstance(FrameSets((posed,)).names, str)
-
-
-def test_handedness_means_the_same_in_every_molecule() -> None:
-    left = {text: set(local_handedness(smiles(text)).values()) for text in ("C[C@H](N)C(=O)O", "CC[C@H](N)C(=O)NC")}
-    assert len(set.union(*left.values())) == 1, left
-    right = set(local_handedness(smiles("C[C@@H](N)C(=O)O")).values())
-    assert right == {-s for s in left["C[C@H](N)C(=O)O"]}
-    assert local_handedness(smiles("CCO")) == {}

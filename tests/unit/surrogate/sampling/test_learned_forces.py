@@ -22,7 +22,7 @@ from surrogate.sampling import runner
 from surrogate.sampling.domain import in_bath
 from surrogate.sampling.openmm.simulation import KJ_MOL_PER_EV, LearnedForces
 from surrogate.sampling.runner import RolloutConfig, rollout
-from systems.chemistry.matching import match_atoms
+from systems.chemistry.graph import match_atoms
 from systems.chemistry.validity import ENERGY, UNSURE, geometry_from_frames
 from systems.errors import InputError, OutOfDomainError, SurromdError
 from systems.prepare.molecule import scene_from_smiles

@@ -14,7 +14,7 @@ from systems.errors import InputError, UnitError
 from systems.scene import Scene
 from systems.trajectory.codec import open_trajectory, open_writer
 from systems.trajectory.companion_writer import pdb_text
-from systems.units import PARSERS
+from systems.units import DIMENSIONS
 
 VERBS: dict[str, tuple[Any, ...]] = {
     "plan": ("alanine-dipeptide",),
@@ -29,7 +29,7 @@ QUANTITIES = [
     (verb, name)
     for verb in VERBS
     for name in inspect.signature(getattr(sm, verb)).parameters
-    if name.endswith(tuple(PARSERS))
+    if name.endswith(tuple(DIMENSIONS))
 ]
 
 

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from small_scenes import n_unpaired_electrons
-from systems.chemistry import symmetry
+from systems.chemistry import graph as graphs
 from systems.chemistry.bond_orders import ValenceError, perceive
 from systems.chemistry.geometry import signed_volumes, superpose, torsion
 from systems.chemistry.graph import (
@@ -395,8 +395,8 @@ def test_torsions_are_turned_in_every_second_state_with_bonds_as_they_were() -> 
 def test_what_follows_from_a_scene_is_worked_out_once_and_shared_read_only(monkeypatch: pytest.MonkeyPatch) -> None:
     scene = ALA2.with_positions(ALA2.positions_nm)
     asked: list[Scene] = []
-    find = symmetry._double_bonds
-    monkeypatch.setattr(symmetry, "_double_bonds", lambda scene: asked.append(scene) or find(scene))
+    find = graphs._double_bonds
+    monkeypatch.setattr(graphs, "_double_bonds", lambda scene: asked.append(scene) or find(scene))
     assert molecule_key(scene) == molecule_key(ALA2)
     atom_classes(scene), stereocentres(scene), molecule_key(scene)
     assert asked.count(scene) == 1

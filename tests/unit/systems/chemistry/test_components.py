@@ -193,7 +193,7 @@ def test_a_component_that_lacks_heavy_atoms_is_refused(tmp_path: Path) -> None:
     smiles = "N1[C@@H](C)C(=O)NCC(=O)NC(C)(C)C(=O)N[C@@H](C)C(=O)NCC(=O)N[C@@H](C)C(=O)1"
     path = heavy_pdb(labelled(smiles, "ALA GLY AIB ALA GLY ALA"), tmp_path / "cycle.pdb")
     path.write_text("\n".join(line for line in path.read_text().splitlines() if " CB2 " not in line))
-    with pytest.raises(PreparationError, match=r"AIB A3, aminoisobutyric acid lacks CB2"):
+    with pytest.raises(PreparationError, match=r"AIB A3 lacks CB2"):
         prepare(str(path))
 
 

@@ -171,6 +171,6 @@ def test_files_of_earlier_versions_are_read_and_not_continued(tmp_path: Path) ->
             file[f"surromd/{name}"] = np.bytes_(json.dumps(text).encode())
         del file["surromd/checksums"], file["surromd/run_id"]
     assert everything(path) == reference
-    with pytest.raises(TrajectoryError, match="earlier version"):
+    with pytest.raises(TrajectoryError, match="not written by surromd"):
         open_writer(path, pair(), {}, append=True)
     assert everything(path) == reference

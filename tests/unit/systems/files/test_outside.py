@@ -116,4 +116,4 @@ def test_a_cache_entry_that_has_changed_is_made_again(tmp_path: Path, alanine_di
 def test_columns_are_kept_in_little_memory(tmp_path: Path, alanine_dipeptide: Scene) -> None:
     path = tmp_path / "a.h5"
     with open_writer(path, alanine_dipeptide, {}) as writer:
-        assert writer._store.file.id.get_access_plist().get_cache()[2] <= 2**20  # HDF5 2: 8 MiB a column
+        assert writer.file.id.get_access_plist().get_cache()[2] <= 2**20  # HDF5 2: 8 MiB a column

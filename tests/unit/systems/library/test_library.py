@@ -39,8 +39,9 @@ def test_the_groups_hold_every_name_once() -> None:
 def test_molecules_are_what_their_smiles_says(name: str) -> None:
     from rdkit import Chem
     from rdkit.Chem.rdMolDescriptors import CalcMolFormula
+    from rdkit_of_scene import to_rdkit
 
-    from systems.prepare.molecule import scene_from_smiles, to_rdkit
+    from systems.prepare.molecule import scene_from_smiles
 
     scene = named_scenes.load(name)
     formula, n_atoms = MD17[name]
@@ -113,7 +114,7 @@ def test_chignolins_are_told_apart_and_extended() -> None:
         ca = [i for i, n in enumerate(scene.atom_names) if n == "CA"]
         # Folded, the ends meet within 0.7 nm.
         assert np.linalg.norm(scene.positions_nm[ca[0]] - scene.positions_nm[ca[-1]]) > 2.0
-        assert "not folded" in named_scenes.describe(name)
+        assert "not folded" in named_scenes.entry(name).title
 
 
 @pytest.mark.parametrize("name", STRUCTURES)
@@ -131,14 +132,14 @@ def test_capped_dipeptides_are_made_from_their_name() -> None:
     scene = prepare("ACE-SER-GLY-NME")
     assert scene.residue_names == ("ACE", "SER", "GLY", "NME")
     assert scene.name == scene.provenance["library_name"] == "ACE-SER-GLY-NME"
-    assert named_scenes.protocols("ACE-SER-GLY-NME") == ()
+    assert named_scenes.entry("ACE-SER-GLY-NME").protocols == ()
 
 
 def test_tetrapeptides_are_made_from_one_letter_code() -> None:
     scene = prepare("SDFS")
     assert scene.residue_names == ("SER", "ASP", "PHE", "SER")
     assert int(scene.formal_charges.sum()) == -1
-    assert named_scenes.protocols("SDFS") == named_scenes.protocols("SER-ASP-PHE-SER") == ("mdgen",)
+    assert named_scenes.entry("SDFS").protocols == named_scenes.entry("SER-ASP-PHE-SER").protocols == ("mdgen",)
 
 
 @pytest.mark.parametrize("name", ["n-body-charged", "harmonic-oscillator:1",
@@ -164,21 +165,19 @@ def test_protocols_name_settings_that_runs_have() -> None:
 
     known = {f.name for c in (MDConfig, ForceFieldSpec) for f in dataclasses.fields(c)} | {"ensemble"}
     for name in named_scenes.names():
-        own = named_scenes.own_settings(name)
+        own = named_scenes.entry(name).own_settings
         assert set(own) <= known, name
         # Settings of its own has what no other name can ask for.
         is_model = named_scenes.load(name).interactions is not None
-        assert bool(own) == is_model == bool(named_scenes.source_of_settings(name)), name
-        assert all(find_protocol(each) for each in named_scenes.protocols(name))
-        own.clear()  # a copy
+        assert bool(own) == is_model == bool(named_scenes.entry(name).source), name
+        assert all(find_protocol(each) for each in named_scenes.entry(name).protocols)
     for protocol in PROTOCOLS.values():
         assert set(protocol.settings) <= known, protocol.name
         assert protocol.source
-    assert named_scenes.own_settings("double-well")
 
 
 def test_the_md17_protocol_is_the_published_one() -> None:
-    assert all(named_scenes.protocols(name) == ("md17",) for name in MD17)
+    assert all(named_scenes.entry(name).protocols == ("md17",) for name in MD17)
     settings = find_protocol("md17").settings
     published = {"temperature_k": 500.0, "timestep_ps": 0.0005, "save_every_ps": 0.005}
     assert {key: settings[key] for key in published} == published

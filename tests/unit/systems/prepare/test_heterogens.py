@@ -13,7 +13,7 @@ from systems.library import named_scenes
 from systems.library.named_scenes import prepare
 from systems.prepare.bonding import find_bonds
 from systems.prepare.heterogens import is_water
-from systems.prepare.read.records import AtomRecord
+from systems.prepare.records import AtomRecord
 from systems.trajectory.companion_writer import pdb_text
 
 ALA2 = named_scenes.load("alanine-dipeptide")
@@ -21,7 +21,7 @@ PEPTIDE = "".join(f"{line}\n" for line in pdb_text(ALA2).splitlines() if line.st
 
 
 def _atom(name: str, residue: str, number: int, at: tuple[float, float, float], element: str) -> AtomRecord:
-    return AtomRecord("1", name, "", residue, "W", str(number), at, 1.0, element, True)
+    return AtomRecord(name, element, residue, "W", str(number), at, hetero=True)
 
 
 def _line(serial: int, name: str, residue: str, number: int, at: tuple[float, float, float], element: str = "") -> str:

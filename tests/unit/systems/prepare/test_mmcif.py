@@ -10,7 +10,7 @@ from systems.chemistry.graph import molecule_key
 from systems.errors import InputError, PreparationError
 from systems.library import named_scenes
 from systems.library.named_scenes import prepare
-from systems.prepare.read.structure_text import read_structure
+from systems.prepare.structure_text import read_structure
 
 ALA2 = named_scenes.load("alanine-dipeptide")
 COLUMNS = (

@@ -13,8 +13,8 @@ from systems.chemistry.graph import molecule_key
 from systems.errors import InputError, PreparationError
 from systems.library import named_scenes
 from systems.library.named_scenes import prepare
+from systems.prepare.mol2_file import element_of
 from systems.prepare.molecule import scene_from_mol_file, scene_from_smiles
-from systems.prepare.read.mol2_file import element_of
 from systems.scene import Scene
 
 SYBYL = {"C": "C.3", "N": "N.3", "O": "O.3", "S": "S.3", "P": "P.3"}

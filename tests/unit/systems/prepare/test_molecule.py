@@ -12,14 +12,14 @@ import pytest
 from drug_like_smiles import Case, cases, what_is_wrong
 from rdkit import Chem, rdBase
 from rdkit.Chem import rdDepictor
+from rdkit_of_scene import to_rdkit
 
 from small_scenes import n_unpaired_electrons
 from systems.chemistry.graph import molecule_key
 from systems.errors import InputError, PreparationError
 from systems.library import named_scenes
 from systems.library.named_scenes import prepare
-from systems.prepare.molecule import scene_from_mol_file, scene_from_smiles, to_rdkit
-from systems.prepare.read.smiles import refuse_changed_stereo, stereo_labels
+from systems.prepare.molecule import refuse_changed_stereo, scene_from_mol_file, scene_from_smiles, stereo_labels
 from systems.scene import Scene
 
 ACCEPTED = [c for c in cases() if not c.refusal]

@@ -13,7 +13,7 @@ from systems.errors import InputError, PreparationError
 from systems.library import named_scenes
 from systems.library.named_scenes import prepare
 from systems.prepare.checks import check_contacts
-from systems.prepare.read.records import AtomRecord
+from systems.prepare.records import AtomRecord
 from systems.scene import Scene
 from systems.trajectory.companion_writer import pdb_text
 
@@ -137,9 +137,7 @@ def test_an_element_column_that_repeats_the_name_is_no_metal(tmp_path: Path) -> 
     (0.2, "CO", "minimising"), (0.8, "HH", "minimising"), (0.05, "CO", "refused"), (0.0, "HH", "refused"),
 ])  # fmt: skip
 def test_atoms_in_one_place_are_refused_and_close_ones_said(gap: float, elements: str, expected: str) -> None:
-    atoms = [
-        AtomRecord(str(k), e, "", "LIG", "A", str(k), (k * gap, 0.0, 0.0), 1.0, e, True) for k, e in enumerate(elements)
-    ]
+    atoms = [AtomRecord(e, e, "LIG", "A", str(k), (k * gap, 0.0, 0.0)) for k, e in enumerate(elements)]
     if expected == "refused":
         with pytest.raises(PreparationError, match=f"{gap:.2f} Å apart.*have the same place"):
             check_contacts(atoms, np.empty((0, 2), dtype=np.int64))

@@ -82,7 +82,7 @@ def _assert_is_ala2(scene: Scene, tolerance_nm: float = 1e-3) -> None:
 
 def test_library_alanine_dipeptide_is_l_trans_and_whole() -> None:
     assert "alanine-dipeptide" in named_scenes.names()
-    assert "phi, psi" in named_scenes.describe("alanine-dipeptide")
+    assert "phi, psi" in named_scenes.entry("alanine-dipeptide").title
     assert (ALA2.formula, ALA2.n_atoms, len(ALA2.bonds)) == ("C6H12N2O2", 22, 21)
     assert ALA2.residue_names == ("ACE", "ALA", "NME")
     double = ALA2.bonds[ALA2.bond_orders == 2].tolist()

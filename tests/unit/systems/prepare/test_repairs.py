@@ -16,10 +16,9 @@ from systems.library.named_scenes import prepare
 from systems.prepare.bonding import find_bonds
 from systems.prepare.checks import handedness, refuse_changed, say_inverted
 from systems.prepare.heterogens import ligand_atoms
-from systems.prepare.protonation import protonation_summary
-from systems.prepare.read.records import AtomRecord, standardise
-from systems.prepare.read.structure_text import decode, encode, read_structure
-from systems.prepare.repair import _with_usual_lengths, complete
+from systems.prepare.records import AtomRecord, standardise
+from systems.prepare.repair import _with_usual_lengths, complete, protonation_summary
+from systems.prepare.structure_text import decode, encode, read_structure
 from systems.trajectory.companion_writer import pdb_text
 
 ALA2 = named_scenes.load("alanine-dipeptide")
@@ -45,7 +44,7 @@ def _write(path: Path, *parts: str) -> str:
 
 
 def _record(name: str, residue: str, number: str, x: float, y: float, z: float, element: str) -> AtomRecord:
-    return AtomRecord("1", name, "", residue, "A", number, (x, y, z), 1.0, element, False)
+    return AtomRecord(name, element, residue, "A", number, (x, y, z))
 
 
 def test_what_stands_beside_the_peptide_is_refused_kept_or_dropped_as_told(tmp_path: Path) -> None:

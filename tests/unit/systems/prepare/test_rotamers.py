@@ -12,7 +12,7 @@ from systems.chemistry.residues import amino_acid_names, template_for
 from systems.errors import PreparationError
 from systems.library.named_scenes import prepare
 from systems.prepare import repair
-from systems.prepare.rotamers import _conformers, _tree, residue_shape, resolve_side_chains
+from systems.prepare.repair import _conformers, _tree, residue_shape, resolve_side_chains
 
 
 @pytest.mark.parametrize("name", [n for n in amino_acid_names() if n not in ("GLY", "ALA", "PRO")])

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from rdkit import Chem
 from rdkit.Chem import rdDistGeom
+from rdkit_of_scene import to_rdkit
 
 from systems.errors import PreparationError
 from systems.library.named_scenes import prepare
-from systems.prepare.molecule import to_rdkit
 
 
 @pytest.mark.parametrize(

@@ -9,12 +9,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from systems.chemistry.cell import cell_of
+from systems.chemistry.distance_bonds import cell_of
 from systems.chemistry.graph import molecule_key
 from systems.errors import PreparationError, SurromdError
 from systems.library import named_scenes
 from systems.library.named_scenes import prepare
-from systems.prepare.read.structure_text import read_structure
+from systems.prepare.structure_text import read_structure
 from systems.scene import Scene
 from systems.trajectory.companion_writer import pdb_text
 

@@ -9,7 +9,7 @@ import h5py
 import numpy as np
 import pytest
 
-from systems.chemistry.cell import box_vectors, lengths_and_angles
+from systems.chemistry.distance_bonds import box_vectors, lengths_and_angles
 from systems.errors import InputError
 from systems.scene import Scene
 from systems.trajectory.codec import open_trajectory, open_writer

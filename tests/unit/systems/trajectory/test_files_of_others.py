@@ -1,4 +1,4 @@
-"""Every format that `compare` reads, with files that other programs than its reader wrote (`Format.tried`).
+"""Every format that `compare` reads, with files that other programs than its reader wrote (the manual's table).
 
 Files of GROMACS, LAMMPS, DL_POLY, GROMOS, HOOMD-blue, Tinker and others are MDAnalysisTests' (`pip install
 MDAnalysisTests gsd pytng pandas`; what is lacking is skipped); cpptraj and OpenMM write theirs here.
@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from format_table import tried_with
 from systems.errors import SurromdError
 from systems.scene import Scene
 from systems.trajectory.codec import open_trajectory
@@ -78,7 +79,7 @@ def test_files_that_other_programs_wrote(row: Row, tmp_path: Path) -> None:
     program, name, as_name, top, n_frames, n_atoms, lag, edge = row
     path = _stored(name, as_name, tmp_path)
     _needs(path)
-    assert program in format_of(path).tried or program == "the PDB"
+    assert program in tried_with(format_of(path).name) or program == "the PDB"
     topology = None
     if top == "carbons":
         atom = "HETATM{:5d}  C   UNK A{:4d}    {:8.3f}{:8.3f}{:8.3f}  1.00  0.00           C\n"
@@ -144,7 +145,7 @@ def test_files_of_cpptraj(made: tuple[Path, np.ndarray], suffix: str) -> None:
     folder, frames = made
     path = folder / f"a.{suffix}"
     _needs(path)
-    assert "cpptraj" in format_of(path).tried
+    assert "cpptraj" in tried_with(format_of(path).name)
     n = 1 if "onlyframes" in CPPTRAJ[suffix] else N
     with open_trajectory(path, top=folder / "top.pdb") as reader:
         assert reader.n_frames == n
@@ -193,7 +194,7 @@ def test_files_of_openmm(tmp_path: Path, alanine_dipeptide: Scene) -> None:
     state = simulation.context.getState(positions=True).getPositions(asNumpy=True).value_in_unit(unit.nanometer)
     for name, n, timed in (("a.pdb", 3, False), ("a.pdbx", 3, False), ("a.dcd", 3, True), ("a.xtc", 3, True),
                            ("a.xml", 1, False)):  # fmt: skip
-        assert "OpenMM" in format_of(tmp_path / name).tried
+        assert "OpenMM" in tried_with(format_of(tmp_path / name).name)
         with open_trajectory(tmp_path / name, top=tmp_path / "top.pdb") as reader:
             assert reader.n_frames == n, name
             assert reader.read(n - 1)[0] == pytest.approx(np.array(state), abs=6e-4), name
@@ -204,12 +205,13 @@ def test_files_of_openmm(tmp_path: Path, alanine_dipeptide: Scene) -> None:
 
 def test_every_line_of_the_table_names_a_program_that_is_tried_here() -> None:
     """Two formats are MDTraj's alone: nobody else's file of Desmond's or of MSMBuilder's could be had."""
-    assert {f.name for f in FORMATS if not f.tried} == {"Desmond", "MSMBuilder LH5"}
+    alone = {f.name for f in FORMATS if tried_with(f.name).endswith(" alone")}
+    assert alone == {"Desmond", "MSMBuilder LH5"}
     of_rows = {format_of(Path(as_name or name)).name for _, name, as_name, *_ in STORED}
     of_cpptraj = {format_of(Path(f"a.{s}")).name for s in CPPTRAJ}
     of_openmm = {format_of(Path(f"a.{s}")).name for s in ("pdb", "pdbx", "dcd", "xtc", "xml")}
     elsewhere = {"surromd's and MDTraj's HDF5", "ASE"}  # test_foreign_files, test_formats
-    assert {f.name for f in FORMATS if f.tried} == of_rows | of_cpptraj | of_openmm | elsewhere
+    assert {f.name for f in FORMATS} - alone == of_rows | of_cpptraj | of_openmm | elsewhere
 
 
 def test_virtual_sites_in_a_topology_are_left_alone(tmp_path: Path) -> None:

@@ -9,13 +9,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from format_table import format_rows
 from systems.errors import InputError, TrajectoryError
 from systems.scene import Scene
 from systems.trajectory.codec import open_trajectory
 from systems.trajectory.companion_writer import pdb_text
 from systems.trajectory.dcd_file import AKMA_PS, cells_of_blocks
 from systems.trajectory.foreign_readers import trr_positions
-from systems.trajectory.foreign_scenes import EVERY, FORMATS, NONE, OTHER, format_of, markdown
+from systems.trajectory.foreign_scenes import EVERY, FORMATS, NONE, OTHER, format_of
 
 mdtraj = pytest.importorskip("mdtraj")
 mda = pytest.importorskip("MDAnalysis")
@@ -78,23 +79,27 @@ def test_readers_go_by_the_table(folder: Path, frames: np.ndarray, name: str) ->
             assert reader.time_ps == pytest.approx(TIMES, abs=1e-4)
         assert any("unit of length" in note for note in reader.notes) is bool(line.unit_taken)
         cells = reader.read_cells(0, 1)
-        if line.cell == EVERY:
+        if format_rows()[line.name]["cell"] == EVERY:
             assert cells is not None and cells[0] == pytest.approx(BOX, abs=2e-3)
     if line.names_atoms:
         with open_trajectory(folder / name) as reader:
             assert reader.scene is not None and len(reader.scene.bonds) == 21
 
 
-def test_the_table_is_whole_and_the_manual_prints_it() -> None:
+def test_the_manual_s_table_is_the_one_that_readers_go_by() -> None:
     from mdtraj.formats.registry import FormatRegistry
 
     suffixes = [s for f in FORMATS for s in f.suffixes]
     assert len(suffixes) == len(set(suffixes))
     assert all(format_of(Path(f"a{s}")) is not OTHER for s in FormatRegistry.loaders)
     assert format_of(Path("a.unheard")) is OTHER
-    assert all(f"`{s}`" in markdown() for s in suffixes) and markdown().count("\n") == len(FORMATS) + 2
-    manual = Path(__file__).parents[4] / "docs" / "files.md"
-    assert "```{formats}" in manual.read_text(encoding="utf-8")
+    rows = format_rows()
+    assert list(rows) == [f.name for f in (*FORMATS, OTHER)]
+    for each in FORMATS:
+        row = rows[each.name]
+        assert row["format"].endswith(f"({', '.join(f'`{s}`' for s in each.suffixes)})")
+        assert (row["read by"], row["positions"], row["times"]) == (each.reader, each.positions, each.times)
+        assert (row["atoms"] != NONE) is each.names_atoms and each.unit_taken in row["unit of length"]
 
 
 def test_times_of_a_gro_file_count_only_where_every_title_states_one(folder: Path, tmp_path: Path) -> None:

@@ -6,21 +6,21 @@ Peptides among them (standard residues, which a force field of peptides describe
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import networkx as nx
 import numpy as np
-import numpy.typing as npt
 
 from systems.chemistry.bond_orders import bent_carbons, lewis_structure
-from systems.chemistry.cell import bonded_images, cell_of, images_of_whole
-from systems.chemistry.distance_bonds import bonds_by_distance
+from systems.chemistry.distance_bonds import bonded_images, bonds_by_distance, cell_of, images_of_whole
 from systems.chemistry.element_data import element_symbol, ion_symbol, is_element, is_lone_ion
 from systems.chemistry.residues import canonical_heavy_name, template_for
 from systems.errors import InputError, PreparationError
-from systems.prepare.read.records import AtomRecord, StructureFile, read_text
+from systems.prepare.records import AtomRecord, StructureFile, read_text
+from systems.scene import FloatArray, IntArray, neighbours_of
 
 _TWO_LETTERS = re.compile(r"cl|br|si|se", re.IGNORECASE)
 _FIRST_LETTERS = ("H", "B", "C", "N", "O", "F", "P", "S", "I")
@@ -41,8 +41,8 @@ class Mol2:
 
     names: tuple[str, ...]
     elements: tuple[str, ...]
-    positions_nm: npt.NDArray[np.float64]
-    bonds: npt.NDArray[np.int64]
+    positions_nm: FloatArray
+    bonds: IntArray
     orders: dict[tuple[int, int], int]
     charge: float | None
     residues: tuple[tuple[str, str], ...]
@@ -96,6 +96,7 @@ def read_mol2(text: str, path: Path, notes: list[str]) -> Mol2:
     if not bonds and len(atoms) > 1:
         bonds = {(int(i), int(j)) for i, j in bonds_by_distance(elements, x)}
         notes.append("no bonds in the file: bonds from distances")
+    is_typed = "ar" in {row[3].lower() for row in sections.get("BOND", []) if len(row) > 3}
     partial = [
         float(row[8]) for row in atoms if len(row) > 8 and re.fullmatch(r"[-+]?[\d.]+(e[-+]?\d+)?", row[8], re.I)
     ]
@@ -104,7 +105,7 @@ def read_mol2(text: str, path: Path, notes: list[str]) -> Mol2:
         elements=tuple(elements),
         positions_nm=x,
         bonds=np.array(sorted(bonds), dtype=np.int64).reshape(-1, 2),
-        orders=orders if any(order > 1 for order in orders.values()) or "ar" in _types(sections) else {},
+        orders=orders if any(order > 1 for order in orders.values()) or is_typed else {},
         charge=sum(partial) if len(partial) == len(atoms) and any(partial) else None,
         residues=tuple((row[6] if len(row) > 6 else "1", row[7] if len(row) > 7 else "MOL") for row in atoms),
         block=_rewritten(atoms, sections.get("BOND", []), number_of),
@@ -144,7 +145,6 @@ def molecule_of(found: Mol2, notes: list[str]) -> Any | None:
     perceived by itself. Of structures that differ in their charge, that of the partial charges is chosen.
     """
     from rdkit import Chem
-    from rdkit.Geometry import Point3D
 
     graph = nx.Graph(found.bonds.tolist())
     graph.add_nodes_from(range(len(found.elements)))
@@ -169,12 +169,19 @@ def molecule_of(found: Mol2, notes: list[str]) -> Any | None:
         molecule.AddAtom(atom)
     for pair, order in orders.items():
         molecule.AddBond(*pair, Chem.BondType.values[order])
-    conformer = Chem.Conformer(len(found.elements))
-    for i, (a, b, c) in enumerate((10.0 * found.positions_nm).tolist()):
-        conformer.SetAtomPosition(i, Point3D(a, b, c))
-    conformer.Set3D(True)
-    molecule.AddConformer(conformer, assignId=True)
+    add_conformer(molecule, (10.0 * found.positions_nm).tolist())
     return molecule
+
+
+def add_conformer(molecule: Any, positions_angstrom: Sequence[Sequence[float]]) -> None:
+    """Give an RDKit molecule these positions `(n_atoms, 3)`."""
+    from rdkit import Chem
+
+    conformer = Chem.Conformer(len(positions_angstrom))
+    conformer.Set3D(True)
+    for i, place in enumerate(positions_angstrom):
+        conformer.SetAtomPosition(i, place)
+    molecule.AddConformer(conformer, assignId=True)
 
 
 def _perceive(
@@ -213,10 +220,8 @@ def _perceive(
 
 def missing_hydrogens(found: Mol2) -> PreparationError:
     """Return the error for a molecule without a Lewis structure, naming the atoms whose geometry says why, if any."""
-    graph = nx.Graph(found.bonds.tolist())
-    graph.add_nodes_from(range(len(found.elements)))
-    neighbours = [sorted(graph[i]) for i in range(len(found.elements))]
-    bent = bent_carbons(found.elements, neighbours, range(len(found.elements)), found.positions_nm)
+    n = len(found.elements)
+    bent = bent_carbons(found.elements, neighbours_of(found.bonds, n), range(n), found.positions_nm)
     if bent:
         names = ", ".join(found.names[i] for i in bent[:4])
         return PreparationError(f"{names} lack hydrogens; give the molecule with all hydrogens, or as SDF.")
@@ -254,10 +259,6 @@ def _cell(rows: list[list[str]]) -> Any:
         return cell_of([float(value) for value in rows[0][:6]]) if rows else None
     except ValueError:
         return None
-
-
-def _types(sections: dict[str, list[list[str]]]) -> set[str]:
-    return {row[3].lower() for row in sections.get("BOND", []) if len(row) > 3}
 
 
 def _bonds(
@@ -301,21 +302,12 @@ def is_peptide_mol2(path: Path) -> bool:
 def read_peptide_mol2(path: Path) -> StructureFile:
     """Return the atoms of a peptide's MOL2 file, in its order, and its bonds. Raises InputError; see `read_mol2`."""
     notes: list[str] = []
-    found: Mol2 = read_mol2(read_text(path, "a molecule with coordinates"), path, notes)
+    found = read_mol2(read_text(path, "a molecule with coordinates"), path, notes)
     atoms = [
-        AtomRecord(
-            serial=str(k + 1),
-            name=found.names[k],
-            altloc="",
-            residue_name=_residue_name(*found.residues[k]),
-            chain="",
-            residue_id=found.residues[k][0],
-            position_angstrom=(x, y, z),
-            occupancy=1.0,
-            element=found.elements[k],
-            hetero=False,
+        AtomRecord(name, element, _residue_name(*residue), "", residue[0], (x, y, z), str(k))
+        for k, (name, element, residue, (x, y, z)) in enumerate(
+            zip(found.names, found.elements, found.residues, (10.0 * found.positions_nm).tolist(), strict=True), start=1
         )
-        for k, (x, y, z) in enumerate((10.0 * found.positions_nm).tolist())
     ]
     return StructureFile(atoms, conect=[(i, j) for i, j in found.bonds.tolist()], notes=notes)
 
