@@ -13,7 +13,7 @@ import numpy.typing as npt
 import torch
 
 from surrogate.data.frames import fitted_atoms
-from surrogate.models.lean import with_compiled_parts, with_lean_parts
+from surrogate.models.layers import with_compiled_parts, with_lean_parts
 from surrogate.models.potential import Potential
 from surrogate.models.propagator import Propagator, draw_noise
 from surrogate.training.devices import choose_precision, keep_freed_memory, torch_threads

@@ -15,8 +15,7 @@ import numpy.typing as npt
 import torch
 
 from surrogate.data.frames import in_standard_pose
-from surrogate.data.shipped import shipped_weights
-from surrogate.models.architecture import architecture
+from surrogate.models.architecture import architecture, shipped_weights
 from surrogate.models.peptides.chains import FREE_ENDS
 from surrogate.models.peptides.layout import PeptideConfig, chain_features, standard_peptide
 from surrogate.models.peptides.model import PeptideSlide

@@ -23,7 +23,7 @@ import numpy as np
 import numpy.typing as npt
 
 from surrogate.sampling.chunks import ChunkSampler, noise_seed
-from surrogate.sampling.openmm.coupling import Coupling, EnergyCheck, MemberSpread
+from surrogate.sampling.coupling import Coupling, EnergyCheck, MemberSpread
 from systems.chemistry.validity import (
     ANGLE,
     DRIFT,

@@ -20,9 +20,9 @@ import torch
 from surrogate.models.potential import Potential
 from surrogate.sampling.chunks import ChunkSampler, noise_seed
 from surrogate.sampling.config import GUARDS, RolloutConfig
+from surrogate.sampling.coupling import Coupling, EnergyCheck, MemberSpread, ReferenceDifference, RelaxedEnergy
 from surrogate.sampling.domain import DomainMatch, fit_weights, in_bath
 from surrogate.sampling.interventions import Chunk, Clock, Guard, Interventions, Tally, none_through
-from surrogate.sampling.openmm.coupling import Coupling, EnergyCheck, MemberSpread, ReferenceDifference, RelaxedEnergy
 from systems.chemistry.validity import INVALID, Geometry, check_frames
 from systems.errors import InputError, SimulationError, first_line
 from systems.files.outside import UNREADABLE, arrays_in, check_disk

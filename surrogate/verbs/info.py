@@ -6,7 +6,7 @@ import math
 from pathlib import Path
 from typing import Any
 
-from surrogate.data.shipped import shipped_weights
+from surrogate.models.architecture import shipped_weights
 from surrogate.verbs.campaign import describe_campaign
 from surrogate.verbs.options import PathLike
 from systems.errors import InputError, OutOfDomainError, first_line

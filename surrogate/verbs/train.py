@@ -8,8 +8,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from surrogate.data.shipped import weights_path
-from surrogate.models.architecture import architecture, names
+from surrogate.models.architecture import architecture, names, weights_path
 from surrogate.progress import progress_bar
 from surrogate.verbs.learn_molecule import learn_molecule
 from surrogate.verbs.messages import tell

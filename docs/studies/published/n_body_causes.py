@@ -34,8 +34,7 @@ from torch import Tensor, nn
 
 from md_reference.run.machine import machine_name
 from surrogate.models.lam_slide import flow
-from surrogate.models.lam_slide.model import LamSlide
-from surrogate.models.lam_slide.network import Decoded, LamSlideConfig
+from surrogate.models.lam_slide.model import Decoded, LamSlide, LamSlideConfig
 from surrogate.models.lam_slide.trainer import (
     FlowWindows,
     autoencoder_loss,

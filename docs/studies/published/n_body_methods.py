@@ -140,7 +140,7 @@ def lam_slide(train: ParticleSet, validation: ParticleSet, settings: Settings) -
 
 def set_forecaster(settings: Settings, n_particles: int) -> LamSlide:
     """Return LaM-SLidE with a set of latents: of sizes for a CPU, or of the published ones (Table 10)."""
-    from surrogate.models.lam_slide.network import AutoencoderConfig
+    from surrogate.models.lam_slide.model import AutoencoderConfig
 
     code = AutoencoderConfig(identifier_pool=n_particles, latent_dim=32, n_octaves=3, type_weight=0.1)
     if settings.paper_size:

@@ -23,7 +23,7 @@ import numpy as np
 import torch
 
 from surrogate import api
-from surrogate.data.shipped import shipped_weights
+from surrogate.models.architecture import shipped_weights
 from surrogate.models.weights import load_weights
 from systems.library import named_scenes
 from systems.trajectory.codec import open_trajectory, open_writer

@@ -29,10 +29,9 @@ from torch import Tensor
 from torch.utils.flop_counter import FlopCounterMode
 
 from surrogate.bench.machine import machine_facts
-from surrogate.data.shipped import weights_path
+from surrogate.models.architecture import weights_path
 from surrogate.models.lam_slide import flow
-from surrogate.models.lam_slide.model import LamSlide
-from surrogate.models.lam_slide.network import Approximator, ApproximatorConfig
+from surrogate.models.lam_slide.model import Approximator, ApproximatorConfig, LamSlide
 from surrogate.models.lam_slide.trainer import FlowWindows, draw_flow_times, flow_loss
 from surrogate.models.propagator import Molecule, draw_noise
 from surrogate.models.weights import load_weights

@@ -28,7 +28,7 @@ from pathlib import Path
 
 from surrogate import api
 from surrogate.data.frames import TrainingFrames, collect_frames
-from surrogate.models.lam_slide.network import ApproximatorConfig, AutoencoderConfig, LamSlideConfig
+from surrogate.models.lam_slide.model import ApproximatorConfig, AutoencoderConfig, LamSlideConfig
 from surrogate.models.lam_slide.trainer import TrainingConfig, is_trained, train_lam_slide
 from surrogate.models.weights import load_weights, save_weights
 from surrogate.progress import training_bar

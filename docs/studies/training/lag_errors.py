@@ -57,7 +57,7 @@ class Row:
 def train(references: Sequence[Path], out: Path, *, longest_lag_ps: float, budget_s: float, compile_: bool) -> None:
     """Train one model for all lags; what is there stays, what was interrupted goes on."""
     from surrogate.data.frames import collect_frames
-    from surrogate.models.lam_slide.network import ApproximatorConfig, LamSlideConfig
+    from surrogate.models.lam_slide.model import ApproximatorConfig, LamSlideConfig
     from surrogate.models.lam_slide.trainer import TrainingConfig, is_trained, train_lam_slide
 
     if is_trained(out):

@@ -26,9 +26,9 @@ from surrogate.models.architecture import (
     TrainingRequest,
 )
 from surrogate.models.lam_slide import flow
-from surrogate.models.lam_slide.model import LamSlide
-from surrogate.models.lam_slide.network import (
+from surrogate.models.lam_slide.model import (
     AutoencoderConfig,
+    LamSlide,
     LamSlideConfig,
     draw_identifiers,
     reconstruction_losses,

@@ -25,12 +25,7 @@ class PainetTraining:
     share of what positions and velocities change by over a chunk, so that the model learns to come back from its own
     errors (Sanchez-Gonzalez 2020). `pushforward`: share of windows that start where the model itself arrives after one
     chunk from the reference, with no gradient through that chunk (Brandstetter 2022). `velocity_weight`: of the last
-    frame's velocity beside the positions, each in units of its own change over a chunk.
-
-    `every_frame`: velocities of all predicted frames count, not the last's alone, and each frame is measured by itself:
-    positions in units of how far atoms have left their straight flight by then, velocities of how much they have
-    changed. Without it the errors of the chunk's first frames hardly count.
-    """
+    frame's velocity beside the positions, each in units of its own change over a chunk."""
 
     budget_s: float | None = None
     steps: int | None = None
@@ -39,7 +34,6 @@ class PainetTraining:
     noise: float = 0.02
     pushforward: float = 0.3
     velocity_weight: float = 0.5
-    every_frame: bool = False
     seed: int = 0
     bf16: bool = False
     device: str = "cpu"
@@ -68,14 +62,12 @@ def train_painet(
     config: PainetTraining,
     *,
     model_class: type[Painet] = Painet,
-    typical: TrainingFrames | None = None,
     start: Weights | None = None,
     resume: bool = False,
     progress: ProgressFn | None = None,
 ) -> Path:
     """Train on `frames`, which carry velocities, and write `out` (.safetensors) with a CSV of the curves beside it.
 
-    `typical`: frames that the weights' domain is measured on, where `frames` hold others as well, hotter ones say.
     `start`: weights of the same configuration that the training begins from, with their scales.
 
     Raises InputError when the frames carry none or are too short, SimulationError when training diverges.
@@ -96,7 +88,7 @@ def train_painet(
         model.load_state_dict(start.model.state_dict())
     stage = StageConfig("forecast", config.batch, config.learning_rate, config.budget_s, config.steps,
                         seed=config.seed, bf16=config.bf16, validate_every_s=config.validate_every_s)  # fmt: skip
-    domain = training_domain(typical or frames, stride=model_config.frame_stride)
+    domain = training_domain(frames, stride=model_config.frame_stride)
 
     def loss_fn(generator: torch.Generator) -> tuple[Tensor, dict[str, Tensor]]:
         return forecast_loss(model, structure, windows, config, generator)
@@ -107,7 +99,7 @@ def train_painet(
 
     def write(spent_s: list[float]) -> None:
         settings = {"seed": config.seed, "noise": config.noise, "pushforward": config.pushforward,
-                    "every_frame": config.every_frame, "training_s": round(sum(spent_s), 1)}  # fmt: skip
+                    "training_s": round(sum(spent_s), 1)}  # fmt: skip
         save_weights(out, model, domain, provenance_of(frames.origin, settings, start))
 
     stages = [Stage(model, stage, loss_fn, validate)]
@@ -120,8 +112,7 @@ class StateWindows:
     with.
 
     `position_scale_nm`, `change_scale_nm_ps`: root mean square displacement and change of velocity over a chunk, what
-    errors are measured in; `velocity_scale_nm_ps`: root mean square velocity. `frame_scales` (2, n_new, 1, 1): root
-    mean square deviation of each frame's positions from straight flight, nm, and change of its velocities, nm/ps.
+    errors are measured in; `velocity_scale_nm_ps`: root mean square velocity.
     """
 
     def __init__(self, frames: TrainingFrames, config: PainetConfig, device: torch.device) -> None:
@@ -136,11 +127,6 @@ class StateWindows:
         self.position_scale_nm = max(float((x_new - x[:, None]).square().mean().sqrt()), 1e-6)
         self.change_scale_nm_ps = max(float((v_new - v).square().mean().sqrt()), 1e-6)
         self.velocity_scale_nm_ps = max(float(v.square().mean().sqrt()), 1e-6)
-        times = frames.lag_ps * config.frame_stride * torch.arange(1, config.n_new + 1, device=device)[:, None, None]
-        left = x_new - x[:, None] - times * v[:, None]
-        changed = self.velocities_after(sample) - v[:, None]
-        self.frame_scales = torch.stack([s.square().mean((0, 2, 3)).sqrt() for s in (left, changed)])[..., None, None]
-        self.frame_scales = self.frame_scales.clamp(min=1e-6)
 
     def state(self, first: np.ndarray) -> tuple[Tensor, Tensor]:
         """Positions and velocities `(b, n_atoms, 3)` at frames `first`."""
@@ -153,16 +139,10 @@ class StateWindows:
         x, v = self.frames.positions_nm(idx), self.velocities[idx[:, -1]]
         return torch.from_numpy(x).to(self.device), torch.from_numpy(v).to(self.device)
 
-    def velocities_after(self, first: np.ndarray) -> Tensor:
-        """Velocities `(b, n_new, n_atoms, 3)` of the chunk after `first`."""
-        idx = first[:, None] + self.config.frame_stride * np.arange(1, self.config.n_new + 1)
-        return torch.from_numpy(self.velocities[idx]).to(self.device)
-
 
 def forecast_loss(model: Painet, structure: Structure, windows: StateWindows, config: PainetTraining,
                   generator: torch.Generator) -> tuple[Tensor, dict[str, Tensor]]:  # fmt: skip
-    """Mean square error of all predicted frames and of the last velocity, each over its scale squared; with
-    `config.every_frame` of all velocities, frame by frame."""
+    """Mean square error of all predicted frames and of the last velocity, each over its scale squared."""
     picked = torch.randint(len(windows.starts), (config.batch,), generator=generator).numpy()
     first = windows.starts[picked]
     x, v = windows.state(first)
@@ -177,13 +157,8 @@ def forecast_loss(model: Painet, structure: Structure, windows: StateWindows, co
         first = np.where(pushed.numpy(), first + windows.span, first)
     x_true, v_true = windows.future(first)
     x_new, v_new = model(x, v, structure)
-    if config.every_frame:
-        scales = windows.frame_scales
-        position = ((x_new - x_true) / scales[0]).square().mean()
-        velocity = ((v_new - windows.velocities_after(first)) / scales[1]).square().mean()
-    else:
-        position = (x_new - x_true).square().mean() / windows.position_scale_nm**2
-        velocity = (v_new[:, -1] - v_true).square().mean() / windows.change_scale_nm_ps**2
+    position = (x_new - x_true).square().mean() / windows.position_scale_nm**2
+    velocity = (v_new[:, -1] - v_true).square().mean() / windows.change_scale_nm_ps**2
     loss = position + config.velocity_weight * velocity
     return loss, {"position": position.detach(), "velocity": velocity.detach()}
 

@@ -12,7 +12,7 @@ import pytest
 
 from surrogate import api
 from surrogate.data.frames import RUN, Split, TrainingFrames, collect_frames, load_frames, refuse_leaks, write_windows
-from surrogate.models.lam_slide.network import LamSlideConfig
+from surrogate.models.lam_slide.model import LamSlideConfig
 from surrogate.models.lam_slide.trainer import TrainingConfig, train_lam_slide
 from systems.errors import InputError
 from systems.scene import Scene

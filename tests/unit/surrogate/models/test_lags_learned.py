@@ -9,7 +9,7 @@ import pytest
 from lag_errors import _correlation
 
 from surrogate.data.frames import TrainingFrames, canonicalise, quantise
-from surrogate.models.lam_slide.network import ApproximatorConfig, AutoencoderConfig, LamSlideConfig
+from surrogate.models.lam_slide.model import ApproximatorConfig, AutoencoderConfig, LamSlideConfig
 from surrogate.models.lam_slide.trainer import TrainingConfig, train_lam_slide
 from surrogate.models.weights import load_weights
 from surrogate.sampling.chunks import ChunkSampler

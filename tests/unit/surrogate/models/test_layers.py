@@ -7,7 +7,7 @@ import torch
 from plain_network import plain_network
 from torch.nn import functional as F
 
-from surrogate.models.lam_slide.network import Approximator, ApproximatorConfig
+from surrogate.models.lam_slide.model import Approximator, ApproximatorConfig
 from surrogate.models.layers import attend, gelu, rotary_angles, rotate
 
 

@@ -10,9 +10,16 @@ import pytest
 import torch
 from torch import nn
 
-from surrogate.data.shipped import weights_path
-from surrogate.models.layers import CrossAttentionBlock, ParallelBlock, rotary_angles
-from surrogate.models.lean import LeanBlock, LeanCrossBlock, PackedLinear, with_lean_parts
+from surrogate.models.architecture import weights_path
+from surrogate.models.layers import (
+    CrossAttentionBlock,
+    LeanBlock,
+    LeanCrossBlock,
+    PackedLinear,
+    ParallelBlock,
+    rotary_angles,
+    with_lean_parts,
+)
 from surrogate.models.weights import load_weights
 from surrogate.sampling.chunks import ChunkSampler, with_bf16_weights
 from surrogate.training.devices import keep_freed_memory

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from md_reference.forces.quantum import Potential
-from surrogate.data.shipped import weights_path
-from surrogate.sampling.openmm.simulation import LearnedForces
+from surrogate.models.architecture import weights_path
+from surrogate.sampling.simulation import LearnedForces
 from systems.prepare.molecule import scene_from_smiles
 
 

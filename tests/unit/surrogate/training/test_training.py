@@ -12,8 +12,7 @@ import pytest
 import torch
 
 from surrogate.data.frames import TrainingFrames, collect_frames, is_windows, load_frames, quantise
-from surrogate.models.lam_slide.model import LamSlide
-from surrogate.models.lam_slide.network import LamSlideConfig, draw_identifiers
+from surrogate.models.lam_slide.model import LamSlide, LamSlideConfig, draw_identifiers
 from surrogate.models.lam_slide.trainer import FlowWindows, TrainingConfig, flow_loss, train_lam_slide, window_frames
 from surrogate.models.weights import Weights, load_weights, provenance_of, read_header, save_weights
 from surrogate.training.loop import StageConfig, StagePlace, learning_rate_factor, run_stage

@@ -19,8 +19,7 @@ from torch import Tensor
 
 from surrogate.data.references import References
 from surrogate.models.architecture import Architecture, Prepared, Settings, Trainer, TrainingRequest
-from surrogate.models.painet.potential.energy import PotentialConfig
-from surrogate.models.painet.potential.model import PainetPotential
+from surrogate.models.painet.energy import PainetPotential, PotentialConfig
 from surrogate.models.propagator import Molecule
 from surrogate.models.weights import TrainingDomain, provenance_of, save_weights
 from surrogate.training.devices import StepThreads, torch_threads

@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
-from surrogate.data.shipped import weights_path
+from surrogate.models.architecture import weights_path
 from surrogate.models.potential import Potential
 from surrogate.models.propagator import Molecule
 from surrogate.models.weights import load_weights
@@ -416,7 +416,7 @@ def _given(scene: str | Path | Scene, weights: str | Path | Weights) -> tuple[Sc
 
         scene = prepare(str(scene))
     if isinstance(weights, str | Path):
-        from surrogate.data.shipped import weights_path
+        from surrogate.models.architecture import weights_path
         from surrogate.models.weights import load_weights
 
         weights = load_weights(weights_path(weights))
