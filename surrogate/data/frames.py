@@ -6,7 +6,7 @@ import hashlib
 import json
 import tempfile
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -28,15 +28,13 @@ if TYPE_CHECKING:
 
 # The pose of a scene that its own shape decides, so that a molecule that no training saw has one too.
 
-FloatArray = npt.NDArray[np.float64]
-
 
 def fitted_atoms(scene: Scene) -> npt.NDArray[np.int64]:
     """Return the atoms that frames are superposed by: the heavy ones, all where fewer than three are heavy."""
     return scene.heavy_idx if len(scene.heavy_idx) >= 3 else np.arange(scene.n_atoms)
 
 
-def standard_turn(scene: Scene) -> FloatArray:
+def standard_turn(scene: Scene) -> npt.NDArray[np.float64]:
     """Return the rotation `(3, 3)` R that lays a scene along its own axes: x moves to `x @ R.T`.
 
     Axes are the principal ones of the fitted atoms, the longest first; the first two point to where the third moment of
@@ -66,8 +64,8 @@ def in_standard_pose(scene: Scene) -> Scene:
 
 # Successive frames that must agree for a leak: one may coincide by chance in a system of one particle, a run does not.
 RUN = 4
-_LEAK_BLOCK = 8192
-IntArray = npt.NDArray[np.int64]
+# Frames that pass through memory at once.
+_BLOCK = 8192
 
 
 @dataclass(frozen=True)
@@ -94,14 +92,6 @@ class Split:
                 cut = begin if k in self.held else end
             found.append((cut, end) if validation else (begin, cut))
         return [(low, high) for low, high in found if high > low]
-
-    def to_dict(self) -> dict[str, Any]:
-        return {"share": self.share, "held": list(self.held)}
-
-    @staticmethod
-    def from_dict(record: dict[str, Any]) -> Split:
-        """Rebuild a split. Raises ValueError for what is none."""
-        return built(Split, record)
 
 
 def refuse_leaks(coordinates: npt.NDArray[Any], starts: npt.NDArray[Any], split: Split,
@@ -132,8 +122,8 @@ def _runs(coordinates: npt.NDArray[Any], ranges: list[tuple[int, int]]) -> Itera
     rng = np.random.default_rng(0)
     factors = rng.integers(0, 2**64, size=coordinates[0].size, dtype=np.uint64) | np.uint64(1)
     for low, high in ranges:
-        for start in range(low, high - RUN + 1, _LEAK_BLOCK):
-            block = coordinates[start : min(start + _LEAK_BLOCK + RUN - 1, high)]
+        for start in range(low, high - RUN + 1, _BLOCK):
+            block = coordinates[start : min(start + _BLOCK + RUN - 1, high)]
             # Products and sums wrap: a fingerprint modulo 2^64.
             marks = block.reshape(len(block), -1).astype(np.int64).view(np.uint64) @ factors
             n = len(marks) - RUN + 1
@@ -149,11 +139,8 @@ def _runs(coordinates: npt.NDArray[Any], ranges: list[tuple[int, int]]) -> Itera
 
 # One unit of the int16 coordinates: 0.0002 nm, range +-6.5 nm. Thermal motion of a bond is ten times larger.
 QUANTUM_NM = 2e-4
-_BLOCK = 8192
 # Frames beyond this are kept in a file.
 MEMORY_BYTES = 2_000_000_000
-# Frames are written into an array or a dataset of HDF5.
-Target = Any
 CONDITIONS = ("force_field", "solvent", "temperature_k", "friction_per_ps", "timestep_ps", "hydrogen_mass_da")
 
 
@@ -169,24 +156,16 @@ class _Header:
     quantum_nm: float = QUANTUM_NM
     split: Split = field(default_factory=Split)
 
-    def of(
-        self,
-        coordinates: npt.NDArray[np.int16],
-        starts: npt.NDArray[np.int64],
-        velocities: npt.NDArray[np.float32] | None,
-    ) -> TrainingFrames:
+    def of(self, coordinates: Any, starts: npt.NDArray[np.int64], velocities: Any) -> TrainingFrames:
         """Return the frames in `coordinates` (n_frames, n_atoms, 3) int16, with this header."""
-        said = {f.name: getattr(self, f.name) for f in fields(_Header) if f.name != "quantum_nm"}
-        return TrainingFrames(**said, coordinates=coordinates, starts=starts, velocities=velocities)
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return the header as JSON has it."""
-        plain = {"scene": self.scene.to_dict(), "sources": list(self.sources), "split": self.split.to_dict()}
-        return {f.name: getattr(self, f.name) for f in fields(_Header)} | plain
+        return TrainingFrames(self.scene, coordinates, starts, self.lag_ps, self.canonical, self.conditions,
+                              self.sources, velocities, self.split)  # fmt: skip
 
     def enter(self, handle: h5py.File, starts: npt.NDArray[np.int64]) -> None:
         """Write header and `starts` into a windows file that holds the frames already."""
-        handle.attrs["surromd_windows"] = json.dumps(self.to_dict())
+        split = {"share": self.split.share, "held": list(self.split.held)}
+        plain = {"scene": self.scene.to_dict(), "sources": list(self.sources), "split": split}
+        handle.attrs["surromd_windows"] = json.dumps({**vars(self), **plain})
         handle.create_dataset("starts", data=starts)
 
 
@@ -258,10 +237,6 @@ class TrainingFrames:
         names = [str(source["file"]) for source in self.sources]
         refuse_leaks(self.coordinates, self.starts, self.split, lambda k: names[k] if names else f"trajectory {k}")
 
-    def header(self) -> _Header:
-        """Return what a windows file says of its frames."""
-        return _Header(**{f.name: getattr(self, f.name) for f in fields(_Header) if f.name != "quantum_nm"})
-
     def save(self, path: str | Path) -> None:
         """Write one HDF5 file that `load_frames` takes back; it appears whole or not at all."""
         if self.turn is not None:
@@ -274,7 +249,9 @@ class TrainingFrames:
                     handle["coordinates"][part] = self.coordinates[part]
                     if self.velocities is not None:
                         handle["velocities"][part] = self.velocities[part]
-                self.header().enter(handle, self.starts)
+                _Header(self.scene, self.lag_ps, self.canonical, self.conditions, self.sources, split=self.split).enter(
+                    handle, self.starts
+                )
 
         create_whole(Path(path), fill)
 
@@ -291,10 +268,7 @@ def _new_file(path: Path, n_frames: int, n_atoms: int, *, moving: bool) -> h5py.
 
 
 def load_frames(path: str | Path) -> TrainingFrames:
-    """Map what `TrainingFrames.save` wrote; files of earlier versions, compressed, are read whole.
-
-    Raises InputError for any other file.
-    """
+    """Map what `TrainingFrames.save` wrote. Raises InputError for any other file."""
     path = Path(path)
     try:
         with open_hdf5(path) as handle:
@@ -310,9 +284,8 @@ def load_frames(path: str | Path) -> TrainingFrames:
 
 
 def _mapped(path: Path, dataset: h5py.Dataset) -> npt.NDArray[Any]:
-    offset = dataset.id.get_offset() if dataset.chunks is None else None
-    if offset is None:
-        return dataset[:]
+    if (offset := dataset.id.get_offset()) is None:
+        raise ValueError(f"{dataset.name} lies in pieces")
     return np.memmap(path, dtype=dataset.dtype, mode="r", offset=offset, shape=dataset.shape)
 
 
@@ -326,14 +299,9 @@ def is_windows(path: Path) -> bool:
 
 
 def collect_frames(
-    paths: list[Path],
-    *,
-    canonical: bool = True,
-    velocities: bool = False,
-    held: list[Path] | None = None,
-    memory_bytes: int = MEMORY_BYTES,
-    spool: Path | None = None,
-) -> TrainingFrames:
+    paths: list[Path], *, canonical: bool = True, velocities: bool = False, held: list[Path] | None = None,
+    memory_bytes: int = MEMORY_BYTES, spool: Path | None = None,
+) -> TrainingFrames:  # fmt: skip
     """Read reference trajectories of one scene. Raises InputError when scenes, save intervals or conditions differ.
 
     With `velocities`, which excludes `canonical`, frames keep their pose and must carry velocities, natural masses'.
@@ -353,12 +321,7 @@ def collect_frames(
 
 
 def write_windows(
-    paths: list[Path],
-    out: Path,
-    *,
-    canonical: bool = True,
-    velocities: bool = False,
-    held: list[Path] | None = None,
+    paths: list[Path], out: Path, *, canonical: bool = True, velocities: bool = False, held: list[Path] | None = None
 ) -> None:
     """Write what `collect_frames` returns to a windows file, block by block: trajectories may be larger than memory."""
     found = _survey(paths, held or [], canonical=canonical, velocities=velocities)
@@ -380,8 +343,9 @@ class _Survey:
     header: _Header
     starts: npt.NDArray[np.int64]
 
-    def read_into(self, coordinates: Target, moving: Target | None) -> _Header:
-        """Read all frames into `coordinates` and `moving` (arrays or data sets); return the header with its sources."""
+    def read_into(self, coordinates: Any, moving: Any) -> _Header:
+        """Read all frames into `coordinates` and, unless None, `moving` (arrays or data sets); return the header with
+        its sources."""
         from systems.trajectory.codec import open_trajectory
 
         scene, sources = self.header.scene, []

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -56,14 +56,9 @@ def collect_sets(paths: list[Path], *, held: list[Path] | None = None, spool: Pa
     """
     seen, also = _by_topology(paths), _by_topology(held or [])
     trained = [_read(files, also.pop(key, []), spool) for key, files in seen.items()]
-    unseen = [_hold_out(_read(files, [], spool)) for files in also.values()]
+    unseen = [_read(files, [], spool) for files in also.values()]
+    unseen = [replace(frames, split=Split(held=tuple(range(len(frames.starts) - 1)))) for frames in unseen]
     sets = FrameSets(tuple(map(_pose, trained)), tuple(map(_pose, unseen)))
-    refuse_mixtures(sets)
-    return sets
-
-
-def refuse_mixtures(sets: FrameSets) -> None:
-    """Raise InputError for sets that one model cannot learn from, and for a system both trained on and held out."""
     first, keys = sets.trained[0], dict[str, TrainingFrames]()
     for frames in (*sets.trained, *sets.unseen):
         name = frames.scene.name
@@ -82,20 +77,14 @@ def refuse_mixtures(sets: FrameSets) -> None:
                 f"{name} and {other.scene.name} are one molecule in two atom orders{both}; give it in one."
             )
         frames.refuse_leaks()
+    return sets
 
 
 def _by_topology(paths: list[Path]) -> dict[str, list[Path]]:
-    from systems.trajectory.codec import open_trajectory
-
     found: dict[str, list[Path]] = {}
     for path in paths:
-        if is_windows(path):
-            found[f"windows {path}"] = [path]
-            continue
-        with open_trajectory(path) as reader:
-            if reader.scene is None:
-                raise InputError(f"{path} carries no topology; give an HDF5 file written by surromd or MDTraj.")
-            found.setdefault(reader.scene.topology_hash, []).append(path)
+        key = f"windows {path}" if is_windows(path) else _summary(path).scene.topology_hash
+        found.setdefault(key, []).append(path)
     return found
 
 
@@ -106,10 +95,6 @@ def _read(paths: list[Path], held: list[Path], spool: Path | None) -> TrainingFr
             raise InputError(f"{paths[0]} holds frames in their own pose; make it without `velocities=True`.")
         return frames
     return collect_frames(paths, held=held, spool=spool)
-
-
-def _hold_out(frames: TrainingFrames) -> TrainingFrames:
-    return replace(frames, split=Split(held=tuple(range(len(frames.starts) - 1))))
 
 
 def _pose(frames: TrainingFrames) -> TrainingFrames:
@@ -199,30 +184,29 @@ class References:
     paths: tuple[Path, ...]
     held: tuple[Path, ...] = ()
     spool: Path | None = None
-    _read: dict[tuple[bool, bool], TrainingFrames] = field(default_factory=dict, init=False, repr=False, compare=False)
 
     @cached_property
     def survey(self) -> Survey:
         """Return what the files say of themselves. Raises InputError for a file without topology or times."""
-        told = [_windows(path) if is_windows(path) else _trajectory(path) for path in (*self.paths, *self.held)]
+        files = [_summary(path) for path in (*self.paths, *self.held)]
         if not self.paths:
             raise InputError("no trajectory given to train on.")
         trained, unseen, longest = dict[str, Scene](), dict[str, Scene](), dict[str, int]()
-        for file in told[: len(self.paths)]:
+        for file in files[: len(self.paths)]:
             key = file.scene.topology_hash
             trained.setdefault(key, file.scene)
             longest[key] = max(longest.get(key, 0), file.n_longest)
-        for file in told[len(self.paths) :]:
+        for file in files[len(self.paths) :]:
             if (key := file.scene.topology_hash) not in trained:
                 unseen.setdefault(key, file.scene)
         return Survey(
             scenes=tuple(trained.values()),
             unseen=tuple(unseen.values()),
             longest=tuple(longest.values()),
-            n_frames=sum(file.n_frames for file in told[: len(self.paths)]),
-            lag_ps=told[0].lag_ps,
-            velocities=all(file.velocities for file in told),
-            equilibrium=all(file.equilibrium for file in told),
+            n_frames=sum(file.n_frames for file in files[: len(self.paths)]),
+            lag_ps=files[0].lag_ps,
+            velocities=all(file.velocities for file in files),
+            equilibrium=all(file.equilibrium for file in files),
         )
 
     def frames(self, *, canonical: bool, velocities: bool = False) -> TrainingFrames:
@@ -231,12 +215,6 @@ class References:
         Raises InputError for files of several molecules, save intervals or conditions; for windows without the
         velocities that are asked for; and where a stretch of motion would be both trained on and validated on.
         """
-        key = (canonical, velocities)
-        if key not in self._read:
-            self._read[key] = self._frames(canonical=canonical, velocities=velocities)
-        return self._read[key]
-
-    def _frames(self, *, canonical: bool, velocities: bool) -> TrainingFrames:
         if not any(is_windows(path) for path in self.paths):
             frames = collect_frames(
                 list(self.paths), canonical=canonical, velocities=velocities, held=list(self.held), spool=self.spool
@@ -262,7 +240,7 @@ class References:
 
 
 @dataclass(frozen=True, eq=False)
-class _Told:
+class _FileSummary:
     scene: Scene
     n_frames: int
     n_longest: int
@@ -271,16 +249,14 @@ class _Told:
     equilibrium: bool
 
 
-def _windows(path: Path) -> _Told:
-    frames = load_frames(path)
-    longest = int(np.diff(frames.starts).max())
-    constant = frames.conditions.get("temperature_k") is not None
-    return _Told(frames.scene, frames.n_frames, longest, frames.lag_ps, frames.velocities is not None, constant)
-
-
-def _trajectory(path: Path) -> _Told:
+def _summary(path: Path) -> _FileSummary:
     from systems.trajectory.codec import open_trajectory
 
+    if is_windows(path):
+        frames = load_frames(path)
+        longest, moving = int(np.diff(frames.starts).max()), frames.velocities is not None
+        constant = frames.conditions.get("temperature_k") is not None
+        return _FileSummary(frames.scene, frames.n_frames, longest, frames.lag_ps, moving, constant)
     with open_trajectory(path) as reader:
         if reader.scene is None:
             raise InputError(f"{path} carries no topology; give an HDF5 file written by surromd or MDTraj.")
@@ -288,4 +264,4 @@ def _trajectory(path: Path) -> _Told:
         lag_ps = float(times[1] - times[0]) if n_frames > 1 else 0.0
         moving = n_frames > 0 and reader.read_velocities(0, 1) is not None
         constant = reader.record.get("kind") == "reference" and reader.record.get("temperature_k") is not None
-        return _Told(reader.scene, n_frames, n_frames, lag_ps, moving, constant)
+        return _FileSummary(reader.scene, n_frames, n_frames, lag_ps, moving, constant)

@@ -15,11 +15,12 @@ import os
 import tomllib
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from dataclasses import dataclass, field, fields, replace
+from copy import deepcopy
+from dataclasses import asdict, dataclass, field, fields, replace
 from functools import cache
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
+from typing import TYPE_CHECKING, Any, ClassVar, Self, TypeVar
 
 from systems.errors import InputError, UnknownNameError, first_line, nearest
 from systems.files.schema import built
@@ -38,6 +39,18 @@ def build(cls: type[T], record: dict[str, Any], prefix: str = "") -> T:
         return built(cls, record, prefix)
     except ValueError as error:
         raise InputError(f"settings: {error}.") from error
+
+
+class ModelConfig:
+    """Base of a model's settings, a frozen dataclass: as a record, which weights files keep, and back."""
+
+    def to_dict(self) -> dict[str, Any]:
+        return asdict(self)  # type: ignore[call-overload]
+
+    @classmethod
+    def from_dict(cls, record: dict[str, Any]) -> Self:
+        """Raises InputError for an unknown key, naming the nearest."""
+        return build(cls, record)
 
 
 def toml_text(record: dict[str, Any], table: str = "") -> str:
@@ -74,28 +87,27 @@ class Suitability:
     reason: str
 
 
-def never(survey: Survey) -> None:
-    """The predicate of an architecture that is trained only when it is asked for by name."""
-
-
 @dataclass(frozen=True)
 class Architecture:
     """One kind of surrogate, under the name that weights files and `arch` have for it.
 
     `config` builds a configuration from a record (InputError for unknown keys), `model` the network from that.
     `trainer` returns its `Trainer`; rollouts do not call it, so that it may import what only training needs.
-    `suits` returns how well the architecture suits references, None where it does not.
+    `suits` returns how well the architecture suits references, None where it does not: it is trained when it is asked
+    for by name.
     """
 
     name: str
     config: Callable[[dict[str, Any]], Any]
     model: Callable[[Any], Propagator]
     trainer: Callable[[], Any]
-    suits: Callable[[Survey], Suitability | None] = never
+    suits: Callable[[Survey], Suitability | None] = lambda survey: None
 
 
 # The interface between the verb `train` and an architecture: choices for the references, settings, the training.
 
+# Settings of trainings that the command line decides.
+RESOLVED = frozenset({"budget_s", "steps", "seed", "device"})
 # (stage, share of all that is to be done) -> None
 AdvanceFn = Callable[[str, float], None]
 
@@ -122,7 +134,7 @@ class TrainingRequest:
 
     def with_choices(self, choices: tuple[Choice, ...]) -> TrainingRequest:
         """Return the request with what was chosen in its tables."""
-        tables = {"model": _copied(self.model), "training": _copied(self.training)}
+        tables = {"model": deepcopy(self.model), "training": deepcopy(self.training)}
         for choice in choices:
             *path, last = choice.key.split(".")
             table: dict[str, Any] = tables
@@ -131,9 +143,11 @@ class TrainingRequest:
             table[last] = choice.value
         return replace(self, model=tables["model"], training=tables["training"])
 
-    def settings(self, kind: type[T], asked: dict[str, Any]) -> T:
-        """Return the training's settings `kind`: the table `training` and what was `asked` for on the command line,
-        which the table may not hold as well. Raises InputError for unknown keys."""
+    def settings(self, kind: type[T], asked: dict[str, Any] | None = None) -> T:
+        """Return the training's settings `kind`: the table `training` and what was `asked` for on the command line
+        (budget, steps, seed and device if None), which the table may not hold as well. Raises InputError for unknown
+        keys."""
+        asked = {name: getattr(self, name) for name in RESOLVED} if asked is None else asked
         if twice := sorted(asked.keys() & self.training):
             raise InputError(f"training.{twice[0]} is set on the command line, not in the configuration file.")
         return build(kind, {**self.training, **asked}, "training.")
@@ -141,15 +155,15 @@ class TrainingRequest:
 
 @dataclass(frozen=True)
 class Choice:
-    """A setting that was chosen for these references: `key` ('model.graph') in the configuration file, its value, and
-    the reason in a few words."""
+    """A setting that was chosen for these references: `key` ('model.longest_ps') in the configuration file, its value,
+    and the reason in a few words."""
 
     key: str
     value: Any
     reason: str
 
     def line(self) -> str:
-        """Return it for people: 'model.graph = true: 28 molecules, atoms known by their bonds'."""
+        """Return it for people: 'model.longest_ps = 900.0: as far as every reference reaches'."""
         shown = str(self.value).lower() if isinstance(self.value, bool) else self.value
         return f"{self.key} = {shown}: {self.reason}"
 
@@ -158,7 +172,7 @@ class Choice:
 class Settings:
     """The configuration of a model and of its training, as they will be used: frozen dataclasses.
 
-    `settled`: names of those of the training that the command line decides (budget, seed, ...), and of those of the
+    `resolved`: names of those of the training that the command line decides (budget, seed, ...), and of those of the
     model that training finds; neither belongs into a configuration file.
     """
 
@@ -230,10 +244,6 @@ class Trainer(ABC):
 def _refuse(arch: str, options: list[str], why: str) -> None:
     if options:
         raise InputError(f"{', '.join(options)}: {arch} {why}; leave it out.")
-
-
-def _copied(table: dict[str, Any]) -> dict[str, Any]:
-    return {key: _copied(value) if isinstance(value, dict) else value for key, value in table.items()}
 
 
 # The installed architectures: entry points of the group `surromd.architectures`, loaded when they are used.

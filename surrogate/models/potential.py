@@ -6,12 +6,13 @@ import copy
 import math
 from abc import abstractmethod
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import dataclass, fields, replace
 from typing import Any, Self
 
 import torch
 from torch import Tensor
 
+from surrogate.models.architecture import ModelConfig
 from surrogate.models.propagator import Chunk, Molecule, Propagator
 from systems.errors import InputError
 from systems.scene import Scene
@@ -31,7 +32,7 @@ ROUNDS = 50
 
 
 @dataclass(frozen=True)
-class IntegratorConfig:
+class IntegratorConfig(ModelConfig):
     """Settings of the MD on a potential, which a potential's own configuration extends.
 
     A chunk is `n_new` frames `lag_ps` apart, in steps of `timestep_ps`, in a Langevin bath at `temperature_k`
@@ -57,9 +58,6 @@ class IntegratorConfig:
     def constrain_hydrogens(self) -> bool:
         """Whether bonds to hydrogen are rigid, as reference MD's are: at steps above 2 fs."""
         return self.timestep_ps > LONGEST_FLEXIBLE_PS
-
-    def to_dict(self) -> dict[str, Any]:
-        return asdict(self)
 
 
 @dataclass(frozen=True, eq=False)

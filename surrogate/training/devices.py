@@ -91,9 +91,8 @@ def choose_precision(wanted: str, *, suits: bool = True) -> Precision:
         return Precision(False, "this model is exact in fp32 alone")
     speed = product_speed()
     through = f" through {speed.unit}" if speed.unit else ""
-    if speed.ratio >= _PAYS:
-        return Precision(True, f"products in bf16{through} are {speed.ratio:.2g} times as fast as in fp32 here")
-    return Precision(False, f"products in bf16 are {speed.ratio:.2g} times as fast as in fp32 here")
+    reason = f"products in bf16{through} are {speed.ratio:.2g} times as fast as in fp32 here"
+    return Precision(speed.ratio >= _PAYS, reason)
 
 
 def bf16_pays(device_type: str) -> bool:

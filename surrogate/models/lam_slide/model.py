@@ -5,14 +5,14 @@ from __future__ import annotations
 import copy
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, field
-from typing import Any, ClassVar
+from dataclasses import dataclass, field
+from typing import ClassVar, cast
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from surrogate.models.architecture import build
+from surrogate.models.architecture import ModelConfig
 from surrogate.models.lam_slide import flow
 from surrogate.models.layers import (
     CrossAttentionBlock,
@@ -24,8 +24,6 @@ from surrogate.models.layers import (
 )
 from surrogate.models.propagator import Chunk, Molecule, Propagator
 from systems.errors import InputError
-
-# LaM-SLidE's settings as frozen dataclasses, readable from TOML; unknown keys are refused with a suggestion.
 
 
 @dataclass(frozen=True)
@@ -78,7 +76,7 @@ class ApproximatorConfig:
     position_weight: float = 0.25
     distance_weight: float = 0.25
     auxiliary_frames: int = 4
-    # Shortest and longest spacing of frames, in ps: the network is told which it is asked for. None: one spacing alone.
+    # Shortest and longest spacing of frames, in ps, which the network takes as an input. None: one spacing alone.
     lag_range_ps: tuple[float, float] | None = None
 
     def __post_init__(self) -> None:
@@ -87,7 +85,7 @@ class ApproximatorConfig:
 
 
 @dataclass(frozen=True)
-class LamSlideConfig:
+class LamSlideConfig(ModelConfig):
     """The whole model. `canonical`: frames are superposed on the template by heavy atoms (exact SE(3) equivariance);
     without it, training rotates at random instead (the paper's augmentation)."""
 
@@ -95,14 +93,6 @@ class LamSlideConfig:
     position_scale_nm: float = 0.2
     autoencoder: AutoencoderConfig = field(default_factory=AutoencoderConfig)
     approximator: ApproximatorConfig = field(default_factory=ApproximatorConfig)
-
-    def to_dict(self) -> dict[str, Any]:
-        return asdict(self)
-
-    @staticmethod
-    def from_dict(record: dict[str, Any]) -> LamSlideConfig:
-        """Raises InputError for an unknown key, naming the nearest."""
-        return build(LamSlideConfig, record)
 
 
 # Stage one: a cross-attention encoder into a few latent vectors and a decoder queried by identifier (section 3.3).
@@ -216,8 +206,7 @@ class LagEmbedding(nn.Module):
         low, high = (math.log(lag) for lag in self.lag_range_ps)
         place = ((lag_ps.float().log() - low) / max(high - low, 1e-6))[:, None]
         angles = place * self.frequency
-        embedded: Tensor = self.of_lag(torch.cat([place, angles.sin(), angles.cos()], dim=-1))
-        return embedded
+        return cast(Tensor, self.of_lag(torch.cat([place, angles.sin(), angles.cos()], dim=-1)))
 
 
 class LatentLayer(nn.Module):
@@ -388,8 +377,7 @@ class LamSlide(Propagator):
         return self.config.approximator.chunk_frames - self.n_conditioning
 
     def identifiers(self, n_atoms: int) -> Tensor:
-        """The canonical assignment `(n_atoms,)`: identifier k for the template's atom k. Permuting a scene's atoms
-        permutes identifiers with them: scenes are matched to the template before they get here."""
+        """The canonical assignment `(n_atoms,)`: identifier k for the template's atom k."""
         return torch.arange(n_atoms, device=self.latent_mean.device)
 
     def at_lag(self, lag_ps: float) -> LamSlide:
@@ -402,15 +390,14 @@ class LamSlide(Propagator):
         return model
 
     def embedded_lag(self, lag_ps: Tensor | None, rows: int) -> Tensor | None:
-        """Return what the latent flow is told of the lags `(rows,)` asked for (the model's own where None), `(rows,
-        width)`; None of a model of one lag."""
+        """Return the lags `(rows,)` (the model's own where None) as the latent flow takes them, `(rows, width)`; None
+        of a model of one lag."""
         if self.approximator.embed_lag is None:
             return None
         if lag_ps is None:
             assert self.lag_ps is not None
             lag_ps = torch.full((rows,), self.lag_ps, device=self.latent_mean.device)
-        embedded: Tensor = self.approximator.embed_lag(lag_ps)
-        return embedded
+        return cast(Tensor, self.approximator.embed_lag(lag_ps))
 
     def encode(self, frames_nm: Tensor, elements: Tensor) -> Tensor:
         """Frames `(..., n_atoms, 3)` nm -> latents `(..., n_latents, latent_dim)`."""

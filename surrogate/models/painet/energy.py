@@ -26,7 +26,6 @@ import torch
 from torch import Tensor, nn
 
 from md_reference import simd as engine
-from surrogate.models.architecture import build
 from surrogate.models.painet.model import EnergyAttention, TypeGroups, type_groups
 from surrogate.models.potential import TOLERANCE, Bath, GradientFn, IntegratorConfig, Potential, at_rest, gradient_of
 from surrogate.models.propagator import Molecule
@@ -71,11 +70,6 @@ class PotentialConfig(IntegratorConfig):
                 raise InputError(f"{name} = {getattr(self, name)} must be at least {least}.")
         if not 0.0 < self.step < 1.0 or not 0.0 <= self.psi_limit < 1.0:
             raise InputError(f"step = {self.step:g} and psi_limit = {self.psi_limit:g} must lie between 0 and 1.")
-
-    @staticmethod
-    def from_dict(record: dict[str, Any]) -> PotentialConfig:
-        """Raises InputError for an unknown key, naming the nearest."""
-        return build(PotentialConfig, record)
 
 
 # Ordered pairs of atoms within reach of each other, and the smooth functions of their distance that a potential sees.

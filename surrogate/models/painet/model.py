@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from surrogate.models.architecture import build
+from surrogate.models.architecture import ModelConfig
 from surrogate.models.propagator import Chunk, Molecule, Propagator
 from systems.errors import InputError
 from systems.units import GAS_CONSTANT_KJ_MOL_K
@@ -225,7 +225,7 @@ MESSAGE_NUMBERS = 2_000_000
 
 
 @dataclass(frozen=True)
-class PainetConfig:
+class PainetConfig(ModelConfig):
     """Size, horizon and physics. `n_new` frames are predicted at once, `frame_stride` reference frames apart: 1 frame
     at a large stride is state-to-state, several are state-to-trajectory.
 
@@ -262,14 +262,6 @@ class PainetConfig:
     @property
     def chunk_ps(self) -> float:
         return self.n_new * self.lag_ps
-
-    def to_dict(self) -> dict[str, Any]:
-        return asdict(self)
-
-    @staticmethod
-    def from_dict(record: dict[str, Any]) -> PainetConfig:
-        """Raises InputError for an unknown key, naming the nearest."""
-        return build(PainetConfig, record)
 
 
 @dataclass(frozen=True, eq=False)

@@ -12,7 +12,15 @@ from torch import Tensor
 
 from surrogate.data.frames import TrainingFrames
 from surrogate.data.references import References
-from surrogate.models.architecture import AdvanceFn, Architecture, Prepared, Settings, Trainer, TrainingRequest
+from surrogate.models.architecture import (
+    RESOLVED,
+    AdvanceFn,
+    Architecture,
+    Prepared,
+    Settings,
+    Trainer,
+    TrainingRequest,
+)
 from surrogate.models.painet.model import EgnnForecaster, Painet, PainetConfig, Structure
 from surrogate.models.weights import Weights, provenance_of, save_weights, training_domain
 from surrogate.training.loop import ProgressFn, Stage, StageConfig, train_stages
@@ -185,10 +193,8 @@ class PainetTrainer(Trainer):
 
     def settings(self, request: TrainingRequest) -> Settings:
         """See `Trainer.settings`. Frame spacing and bath are the reference's (`for_frames`)."""
-        asked = {"budget_s": request.budget_s, "steps": request.steps, "seed": request.seed, "device": request.device}
-        training = request.settings(PainetTraining, asked)
-        resolved = frozenset({*asked, "lag_ps", "temperature_k", "friction_per_ps"})
-        return Settings(PainetConfig.from_dict(request.model), training, resolved)
+        resolved = RESOLVED | {"lag_ps", "temperature_k", "friction_per_ps"}
+        return Settings(PainetConfig.from_dict(request.model), request.settings(PainetTraining), resolved)
 
     def prepare(self, references: References, request: TrainingRequest) -> Prepared:
         """See `Trainer.prepare`. Raises InputError for references without velocities."""

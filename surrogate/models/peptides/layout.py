@@ -5,9 +5,8 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Iterable
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from itertools import product
-from typing import Any
 
 import networkx as nx
 import numpy as np
@@ -16,7 +15,7 @@ import torch
 from torch import Tensor
 
 from surrogate.data.frames import fitted_atoms
-from surrogate.models.architecture import build
+from surrogate.models.architecture import ModelConfig
 from surrogate.models.peptides.chains import (
     FREE_ENDS,
     RIGID,
@@ -269,7 +268,7 @@ class _Builder:
 
 
 @dataclass(frozen=True)
-class PeptideConfig:
+class PeptideConfig(ModelConfig):
     """`types`: of residues that training saw. `shortest_ps`, `longest_ps`: times after the given frame that it was
     shown. `innovation`: the flow runs on innovations, else on the coordinates themselves. `conditioning_noise`: added
     to the given frame in training, in standard deviations. `turning_weight`: what a torsion's numbers count in the loss
@@ -291,14 +290,6 @@ class PeptideConfig:
     tau_scale: float = 1.4
     types: tuple[str, ...] = ()
     scale: ChainScale | None = None
-
-    def to_dict(self) -> dict[str, Any]:
-        return asdict(self)
-
-    @staticmethod
-    def from_dict(record: dict[str, Any]) -> PeptideConfig:
-        """Raises InputError for an unknown key, naming the nearest."""
-        return build(PeptideConfig, record)
 
     @property
     def forgotten_ps(self) -> float:

@@ -17,6 +17,7 @@ from torch import Tensor
 from surrogate.data.frames import TrainingFrames
 from surrogate.data.references import FrameSets, References, Survey
 from surrogate.models.architecture import (
+    RESOLVED,
     AdvanceFn,
     Architecture,
     Choice,
@@ -525,12 +526,10 @@ class PeptideTrainer(Trainer):
 
     def settings(self, request: TrainingRequest) -> Settings:
         """See `Trainer.settings`."""
-        asked = {"budget_s": request.budget_s, "steps": request.steps, "seed": request.seed, "device": request.device}
-        training = request.settings(PeptideTraining, asked)
         model = request.model if request.start_from is None else read_header(request.start_from).config
         if request.start_from is not None:  # learning further, a flow forgets the few steps that it was taught
             model = {key: value for key, value in model.items() if key not in ("usual_steps", "usual_solver")}
-        return Settings(PeptideConfig.from_dict(model), training, frozenset(asked))
+        return Settings(PeptideConfig.from_dict(model), request.settings(PeptideTraining), RESOLVED)
 
     def prepare(self, references: References, request: TrainingRequest) -> Prepared:
         """See `Trainer.prepare`."""
