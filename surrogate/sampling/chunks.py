@@ -5,8 +5,7 @@ from __future__ import annotations
 import copy
 import hashlib
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -30,8 +29,7 @@ _Model = TypeVar("_Model", bound=Propagator)
 _ROWS_OF_ONE_THREAD = 16
 
 
-@dataclass(frozen=True, eq=False)
-class Drawn:
+class Drawn(NamedTuple):
     """New frames `(b, n_new, n_atoms, 3)` nm and, of a model that carries them, the velocities `(b, n_atoms, 3)` nm/ps
     at the last of them; both in the pose of the frames that they follow."""
 
@@ -146,13 +144,10 @@ class ChunkSampler:
             model = self._compiled if len(seeds) == self._compiled_rows else model
         with torch.autocast("cpu", dtype=torch.bfloat16, enabled=self.precision.bf16):
             chunk = model.next_chunk(
-                torch.from_numpy(canonical.astype(np.float32)),
-                self._molecule,
-                noise,
-                solver_steps=self.solver_steps,
+                torch.from_numpy(canonical.astype(np.float32)), self._molecule, noise, solver_steps=self.solver_steps,
                 solver=self.solver,
                 last_velocities_nm_ps=None if turned is None else torch.from_numpy(turned.astype(np.float32)),
-            )
+            )  # fmt: skip
         usual = self.solver_steps if self._model.solvers else 1
         self.drawn += len(seeds)
         self.evaluations += len(seeds) * (usual if chunk.evaluations is None else chunk.evaluations)
@@ -187,7 +182,5 @@ def _alike(velocities: FloatArray | None, n: int) -> list[npt.NDArray[np.int64]]
 
 
 def _out_of_memory(error: BaseException) -> bool:
-    if isinstance(error, MemoryError | torch.OutOfMemoryError):
-        return True
-    text = str(error).lower()
-    return any(words in text for words in ("out of memory", "not enough memory", "can't allocate memory"))
+    words = ("out of memory", "not enough memory", "can't allocate memory")
+    return isinstance(error, MemoryError | torch.OutOfMemoryError) or any(w in str(error).lower() for w in words)

@@ -20,7 +20,7 @@ from surrogate.models.peptides.chains import FREE_ENDS
 from surrogate.models.peptides.layout import PeptideConfig, chain_features, standard_peptide
 from surrogate.models.peptides.model import PeptideSlide
 from surrogate.models.potential import Potential
-from surrogate.models.weights import load_weights, read_header
+from surrogate.models.weights import TrainingDomain, Weights, load_weights, read_header
 from systems.chemistry.graph import bonded_graph, rotatable_torsions
 from systems.chemistry.matching import match_atoms
 from systems.chemistry.validity import INVALID, NOT_FINITE, Geometry, check_frames, flag_names, geometry_from_scene
@@ -30,7 +30,6 @@ from systems.units import format_time_ps
 
 if TYPE_CHECKING:
     from surrogate.models.propagator import Propagator
-from surrogate.models.weights import TrainingDomain, Weights
 
 # Coverage of a scene by a training domain, and the ways in which one leaves it.
 
@@ -67,17 +66,6 @@ def member_of(scene: Scene, domain: TrainingDomain) -> TrainingDomain | None:
             continue
         return replace(member, further=(), transferable=False)
     return None
-
-
-def compare_sets(
-    what: str, scene: Scene, known: list[Scene], of: Callable[[Scene], set[str]], *, forcible: bool
-) -> list[Deviation]:
-    """Return a deviation that names what `of(scene)` holds and that of no known scene does."""
-    new = sorted(of(scene) - set().union(*(of(one) for one in known)))
-    if not new:
-        return []
-    listed = ", ".join(new[:6]) + (f" and {len(new) - 6} more" if len(new) > 6 else "")
-    return [Deviation(what, f"{listed} not seen in training", forcible=forcible)]
 
 
 def bond_types(scene: Scene) -> set[str]:
@@ -225,11 +213,6 @@ def at_lag(weights: Weights, domain: TrainingDomain, lag_ps: float) -> Weights:
     )
 
 
-__all__ = [
-    "Deviation", "DomainMatch", "bond_types", "find_deviations", "fit_weights", "match_domain",
-    "match_known", "match_scene",
-    "torsion_environments",
-]  # fmt: skip
 # A model that does not take the temperature as an input has one; a thermostat is set more finely than this by nobody.
 TEMPERATURE_TOLERANCE_K = 0.5
 
@@ -306,14 +289,9 @@ def match_known(
 
 
 def fit_weights(
-    scene: Scene,
-    weights: Weights,
-    *,
-    temperature_k: float | None = None,
-    force: bool = False,
-    lag_ps: float | None = None,
-    save_every_ps: float | None = None,
-) -> tuple[Weights, DomainMatch]:
+    scene: Scene, weights: Weights, *, temperature_k: float | None = None, force: bool = False,
+    lag_ps: float | None = None, save_every_ps: float | None = None,
+) -> tuple[Weights, DomainMatch]:  # fmt: skip
     """Return weights as a rollout of this scene takes them, for one molecule at one lag, and the match to that.
 
     Raises OutOfDomainError as `match_domain` does, InputError for a lag that the weights were not trained for.
@@ -333,18 +311,10 @@ def in_bath(weights: Weights, asked: dict[str, Any]) -> Weights:
     if not asked:
         return weights
     model, domain = weights.model.in_bath(asked), weights.domain
-    told = {name: value for name, value in asked.items() if name in domain.conditions}
+    changed = {name: value for name, value in asked.items() if name in domain.conditions}
     if "constrain_hydrogens" in domain.conditions:
-        told["constrain_hydrogens"] = model.config.constrain_hydrogens
-    return replace(weights, model=model, domain=replace(domain, conditions={**domain.conditions, **told}))
-
-
-def match_scene(scene: Scene, weights: Weights) -> npt.NDArray[np.int64]:
-    """Return `order (n_atoms,)` of a scene that the weights cover: model atom k is scene atom order[k].
-
-    Raises OutOfDomainError; see `match_domain`.
-    """
-    return match_domain(scene, weights).order
+        changed["constrain_hydrogens"] = model.config.constrain_hydrogens
+    return replace(weights, model=model, domain=replace(domain, conditions={**domain.conditions, **changed}))
 
 
 def _peptides(model: Propagator) -> PeptideConfig | None:
@@ -381,12 +351,17 @@ def _compare_molecules(scene: Scene, template: Scene) -> tuple[npt.NDArray[np.in
         return match_atoms(scene, template), []
     except OutOfDomainError as error:
         refusal = str(error).rstrip(".")
-    found = [
-        *compare_sets("elements", scene, [template], lambda s: set(s.elements), forcible=False),
-        *_compare_sizes(scene, template),
-        *compare_sets("bond types", scene, [template], bond_types, forcible=False),
-        *compare_sets("torsion environments", scene, [template], torsion_environments, forcible=False),
-    ]
+    found: list[Deviation] = []
+
+    def compare(what: str, of: Callable[[Scene], set[str]]) -> None:
+        if new := sorted(of(scene) - of(template)):
+            listed = ", ".join(new[:6]) + (f" and {len(new) - 6} more" if len(new) > 6 else "")
+            found.append(Deviation(what, f"{listed} not seen in training", forcible=False))
+
+    compare("elements", lambda s: set(s.elements))
+    found += _compare_sizes(scene, template)
+    compare("bond types", bond_types)
+    compare("torsion environments", torsion_environments)
     if found or scene.interactions != template.interactions:
         return np.arange(0), found or [Deviation("connectivity", refusal, forcible=False)]
     order = _order_without_stereo(scene, template)

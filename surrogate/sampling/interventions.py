@@ -17,7 +17,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from time import perf_counter
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -92,17 +92,8 @@ class Guard:
 
 def caught(flags: Flags) -> npt.NDArray[np.bool_]:
     """Return which frames do not pass."""
-    found: npt.NDArray[np.bool_] = (flags & np.uint16(CAUGHT)) != 0
-    return found
+    return cast(npt.NDArray[np.bool_], (flags & np.uint16(CAUGHT)) != 0)
 
-
-def finite(flags: Flags) -> npt.NDArray[np.bool_]:
-    """Return which frames are finite."""
-    found: npt.NDArray[np.bool_] = (flags & np.uint16(NOT_FINITE)) == 0
-    return found
-
-
-# The summary of what a rollout did about its own failures: what stands in the file, and what it cost.
 
 # The column `intervention` of a trajectory: what a frame is, if it is not the surrogate's first draw.
 DRAWN_AGAIN, REPAIRED, MD_AFTER_FAILURE, MD_BETWEEN = 1, 2, 3, 4
@@ -114,10 +105,9 @@ MARKS = {
 }
 # What frames of each kind may do to the statistics of a trajectory.
 BIAS = {
-    DRAWN_AGAIN: "states from which the surrogate fails are visited less, and left in other ways than it would leave "
-    "them",
-    REPAIRED: "repaired frames have relaxed bonds and angles, colder than the ensemble's, and later frames follow from "
-    "them",
+    DRAWN_AGAIN: "states from which the surrogate fails are visited less, and left in other ways",
+    REPAIRED: "repaired frames and those that follow from them have relaxed bonds and angles, colder than the "
+    "ensemble's",
     MD_AFTER_FAILURE: "MD stands where the surrogate failed: ensemble and kinetics are a mixture, and each stretch of "
     "MD starts from a relaxed frame with new velocities and warms up within about 1 ps",
     MD_BETWEEN: "MD stands between chunks: ensemble and kinetics are a mixture of the two",
@@ -226,12 +216,9 @@ def none_through(tallies: Sequence[Tally], n_new: int, *, at_end: bool) -> tuple
     reasons: Counter[str] = Counter()
     for tally in tallies:
         reasons.update(tally.reasons)
+    which = f"every one of {chunks} chunks" if chunks > 1 else "its one chunk"
     named = ", ".join(name for name, _ in reasons.most_common())
-    share = f"{100 * frames / (chunks * n_new):.0f} % of frames: {named}"
-    return (
-        row,
-        f"every one of {chunks} chunks was caught ({share})" if chunks > 1 else f"its one chunk was caught ({share})",
-    )
+    return row, f"{which} was caught ({100 * frames / (chunks * n_new):.0f} % of frames: {named})"
 
 
 @dataclass(frozen=True, eq=False)
@@ -254,14 +241,9 @@ class Interventions:
     spread: MemberSpread | None = None
 
     def advance(
-        self,
-        last_nm: FloatArray,
-        velocities_nm_ps: FloatArray | None,
-        tallies: Sequence[Tally],
-        *,
-        chunk: int,
+        self, last_nm: FloatArray, velocities_nm_ps: FloatArray | None, tallies: Sequence[Tally], *, chunk: int,
         step: int,
-    ) -> Chunk:
+    ) -> Chunk:  # fmt: skip
         """Return the chunk number `chunk` after `last_nm (b, n_conditioning, n_atoms, 3)`, `step` frames into the run.
 
         Tallies are brought up to date. Frames stand in it as they are to be written; where `failure` is set, the
@@ -280,25 +262,24 @@ class Interventions:
         return run.chunk
 
 
+@dataclass(eq=False)
 class _Advance:
     """One chunk in the making."""
 
-    def __init__(self, plan: Interventions, last_nm: FloatArray, velocities: FloatArray | None,
-                 tallies: Sequence[Tally], number: int, step: int) -> None:  # fmt: skip
-        self.plan, self.last, self.velocities = plan, last_nm, velocities
-        self.tallies, self.number, self.step = tallies, number, step
+    plan: Interventions
+    last: FloatArray
+    velocities: FloatArray | None
+    tallies: Sequence[Tally]
+    number: int
+    step: int
+    chunk: Chunk = field(init=False)
 
     def draw(self) -> None:
         with self.plan.clock.timed("draw"):
             drawn = self.plan.sampler.draw(self.last, self._seeds(range(len(self.last)), 0), self.velocities)
         shape = drawn.frames_nm.shape[:2]
-        self.chunk = Chunk(
-            drawn.frames_nm,
-            np.zeros(shape, dtype=np.uint16),
-            np.zeros(shape, dtype=np.uint8),
-            np.full(shape, np.nan),
-            drawn.velocities_nm_ps,
-        )
+        flags, marks = np.zeros(shape, dtype=np.uint16), np.zeros(shape, dtype=np.uint8)
+        self.chunk = Chunk(drawn.frames_nm, flags, marks, np.full(shape, np.nan), drawn.velocities_nm_ps)
         self._check(np.arange(shape[0]))
         for row, tally in enumerate(self.tallies):
             bad = np.flatnonzero(caught(self.chunk.flags[row]))
@@ -331,7 +312,7 @@ class _Advance:
         if self.chunk.failure is not None:
             return
         for row in range(len(self.last)):
-            if not finite(self.chunk.flags[row, -1]) or not np.isfinite(self.chunk.frames_nm[row, -1]).all():
+            if self.chunk.flags[row, -1] & NOT_FINITE or not np.isfinite(self.chunk.frames_nm[row, -1]).all():
                 self.chunk.failure = (row, "the model's frames are no longer finite")
                 continue
             invalid = (self.chunk.flags[row] & np.uint16(INVALID | STILL)).all()

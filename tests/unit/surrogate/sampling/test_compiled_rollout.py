@@ -73,7 +73,7 @@ def test_resume_asks_for_the_same(
 
     with pytest.raises(KeyboardInterrupt):
         rollout(alanine_dipeptide, small_weights, [out], fast, progress=stop, flush_every_s=0.0)
-    with pytest.raises(InputError, match=r"started with compile = True, not None"):
+    with pytest.raises(InputError, match=r"started with compile = True, not False"):
         rollout(alanine_dipeptide, small_weights, [out], CONFIG, resume=True)
     rollout(alanine_dipeptide, small_weights, [out], fast, resume=True)
     rollout(alanine_dipeptide, small_weights, [whole], fast)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from surrogate.models.weights import Weights
-from surrogate.sampling.domain import bond_types, find_deviations, match_domain, match_scene, torsion_environments
+from surrogate.sampling.domain import bond_types, find_deviations, match_domain, torsion_environments
 from systems.chemistry.geometry import signed_volumes
 from systems.errors import OutOfDomainError
 from systems.library.named_scenes import load, prepare
@@ -24,7 +24,6 @@ def test_the_training_molecule_is_covered_in_any_atom_order(small_weights: Weigh
     assert find_deviations(alanine_dipeptide, small_weights.domain, temperature_k=300.0) == ()
     found = match_domain(alanine_dipeptide, small_weights, temperature_k=300.4)
     assert np.array_equal(found.order, np.arange(22)) and found.deviations == ()
-    assert np.array_equal(match_scene(alanine_dipeptide, small_weights), found.order)
 
 
 @pytest.mark.parametrize(
@@ -48,7 +47,7 @@ def test_other_molecules_are_refused_with_each_reason(small_weights: Weights, sp
 
 def test_the_sulfur_and_the_new_torsion_are_named(small_weights: Weights) -> None:
     with pytest.raises(OutOfDomainError, match=r"elements: S not seen.*bond types: C-S"):
-        match_scene(prepare("smiles:CSC"), small_weights)
+        match_domain(prepare("smiles:CSC"), small_weights)
     assert torsion_environments(load("alanine-dipeptide")) == {"C(C,H,N)-C(N,O)", "C(C,C,H)-N(C,H)"}
     assert bond_types(load("alanine-dipeptide")) == {"C-C", "C-H", "C-N", "C=O", "H-N"}
 

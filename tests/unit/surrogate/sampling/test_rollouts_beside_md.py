@@ -83,7 +83,7 @@ def test_help_has_flexible_bonds_where_the_reference_had(domain: TrainingDomain,
 def test_weights_that_name_no_force_field_cannot_be_coupled(
     tmp_path: Path, scene: Scene, domain: TrainingDomain
 ) -> None:
-    for conditions, said in (({}, "which force_field"), ({**CONDITIONS, "force_field": "ff00"}, "ff00")):
+    for conditions, said in (({}, "their force_field"), ({**CONDITIONS, "force_field": "ff00"}, "ff00")):
         weights = weights_of(replace(domain, conditions=conditions))
         with pytest.raises(InputError, match=f"cannot be coupled to OpenMM.*{said}"):
             roll(tmp_path / "a.h5", scene, weights, "repair")
