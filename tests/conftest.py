@@ -76,7 +76,7 @@ def harmonic_frames(alanine_dipeptide):
     """Synthetic training frames: correlated Gaussian motion about the library geometry, two runs of 400 frames."""
     import numpy as np
 
-    from surrogate.data.frames import TrainingFrames, canonicalise, quantise
+    from surrogate.data import TrainingFrames, canonicalise, quantise
 
     scene = alanine_dipeptide
     rng = np.random.default_rng(0)

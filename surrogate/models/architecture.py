@@ -26,7 +26,7 @@ from systems.errors import InputError, UnknownNameError, first_line, nearest
 from systems.files.schema import built
 
 if TYPE_CHECKING:
-    from surrogate.data.references import References, Survey
+    from surrogate.data import References, Survey
     from surrogate.models.propagator import Propagator
 
 
@@ -54,10 +54,8 @@ class ModelConfig:
 
 
 def toml_text(record: dict[str, Any], table: str = "") -> str:
-    """Return a record as the TOML of `systems.options.read_toml`; keys whose value is None are left out.
-
-    Values are texts, numbers, booleans, and lists and tables of these; tables in lists are written in one line.
-    """
+    """Return a record of texts, numbers, booleans, and lists and tables of these as TOML, without values that are None;
+    tables in lists are written in one line."""
     kept = {key: value for key, value in record.items() if value is not None}
     lines = [f"{key} = {_inline(value)}" for key, value in kept.items() if not isinstance(value, dict)]
     text = "".join(f"{line}\n" for line in lines)
@@ -103,8 +101,6 @@ class Architecture:
     trainer: Callable[[], Any]
     suits: Callable[[Survey], Suitability | None] = lambda survey: None
 
-
-# The interface between the verb `train` and an architecture: choices for the references, settings, the training.
 
 # Settings of trainings that the command line decides.
 RESOLVED = frozenset({"budget_s", "steps", "seed", "device"})
@@ -215,17 +211,12 @@ class Trainer(ABC):
             _refuse(request.arch, [k for k, v in given.items() if v is not None], "is fitted in one go")
         elif request.budget_s is None and request.steps is None:
             raise InputError("say how long to train: `budget_s='30min'` or `steps=10000`.")
-        unknown = []
-        if request.start_from is not None and not self.goes_on:
-            unknown.append("`start_from`")
-        if request.longest_lag_ps is not None and not self.learns_lags:
-            unknown.append("`longest_lag_ps`")
-        _refuse(request.arch, unknown, "does not know it")
-        if request.start_from is not None:
-            if request.longest_lag_ps is not None:
-                raise InputError("`start_from` takes the configuration of its weights; leave `longest_lag_ps` out.")
-            if request.model:
-                raise InputError("`start_from` takes the configuration of its weights; leave [model] of `config` out.")
+        unknown = {"`start_from`": request.start_from is not None and not self.goes_on,
+                   "`longest_lag_ps`": request.longest_lag_ps is not None and not self.learns_lags}  # fmt: skip
+        _refuse(request.arch, [k for k, is_given in unknown.items() if is_given], "does not know it")
+        if request.start_from is not None and (request.longest_lag_ps is not None or request.model):
+            which = "[model] of `config`" if request.model else "`longest_lag_ps`"
+            raise InputError(f"`start_from` takes the configuration of its weights; leave {which} out.")
 
     def choose(self, references: References, request: TrainingRequest) -> tuple[Choice, ...]:
         """Return the settings that suit the references where they differ from the defaults; those that the request
@@ -246,8 +237,7 @@ def _refuse(arch: str, options: list[str], why: str) -> None:
         raise InputError(f"{', '.join(options)}: {arch} {why}; leave it out.")
 
 
-# The installed architectures: entry points of the group `surromd.architectures`, loaded when they are used.
-
+# Entry points, loaded when they are used.
 GROUP = "surromd.architectures"
 
 
@@ -258,11 +248,8 @@ def names() -> list[str]:
 
 @cache
 def architecture(name: str) -> Architecture:
-    """Return the architecture of this name.
-
-    Raises UnknownNameError, naming the nearest, and InputError where its package cannot be imported or offers
-    something else under that name.
-    """
+    """Return the architecture of this name. Raises UnknownNameError, naming the nearest, and InputError where its
+    package cannot be imported or offers something else under that name."""
     found = _found().get(name)
     if found is None:
         raise UnknownNameError(f"unknown architecture {name!r}; known: {', '.join(names())}.{nearest(name, names())}")
@@ -304,8 +291,6 @@ def _own() -> list[EntryPoint]:
     return [EntryPoint(name, value, GROUP) for name, value in declared.items()]
 
 
-# Weights by name: those that are shipped, or a file.
-
 _FOLDER = Path(__file__).parents[1] / "pretrained"
 
 
@@ -315,10 +300,8 @@ def shipped_weights() -> dict[str, Path]:
 
 
 def weights_path(weights: str | os.PathLike[str]) -> Path:
-    """Return the file of shipped weights by name, or the path itself.
-
-    Raises UnknownNameError (with the nearest name) or InputError when there is no such file.
-    """
+    """Return the file of shipped weights by name, or the path itself. Raises UnknownNameError, naming the nearest, or
+    InputError where there is no such file."""
     path = Path(weights)
     if path.suffix == ".safetensors" or path.exists():
         if not path.is_file():

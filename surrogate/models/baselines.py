@@ -11,10 +11,9 @@ from typing import ClassVar
 import numpy as np
 import numpy.typing as npt
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
-from surrogate.data.frames import TrainingFrames, fitted_atoms
-from surrogate.data.references import References
+from surrogate.data import References, TrainingFrames, fitted_atoms
 from surrogate.models.architecture import Architecture, ModelConfig, Prepared, Settings, Trainer, TrainingRequest
 from surrogate.models.propagator import Chunk, Molecule, Propagator
 from surrogate.models.weights import provenance_of, save_weights, training_domain
@@ -41,7 +40,6 @@ class Baseline(Propagator):
     """What all of them share; those fitted to one molecule work in its canonical frame."""
 
     config: BaselineConfig
-    conditions_on: ClassVar[int] = 1
     fitted: ClassVar[bool] = False
     # Whether successive frames have nothing in common, so that no limit of jumps is theirs.
     leaps: ClassVar[bool] = False
@@ -49,10 +47,6 @@ class Baseline(Propagator):
     def __init__(self, config: BaselineConfig) -> None:
         super().__init__()
         self.config = config
-
-    @property
-    def n_conditioning(self) -> int:
-        return self.conditions_on
 
     @property
     def n_new(self) -> int:
@@ -86,7 +80,7 @@ class ConstantVelocity(Baseline):
     """The step from the frame before the last to the last, repeated."""
 
     arch: ClassVar[str] = "constant-velocity"
-    conditions_on: ClassVar[int] = 2
+    n_conditioning = 2
 
     def frames_after(self, last_frames_nm: Tensor, noise: Tensor) -> Tensor:
         last = last_frames_nm[:, -1:]
@@ -100,11 +94,10 @@ class TrainingFrameResampling(Baseline):
     arch: ClassVar[str] = "resampling"
     fitted: ClassVar[bool] = True
     leaps: ClassVar[bool] = True
-    frames_nm: Tensor
 
     def __init__(self, config: BaselineConfig) -> None:
         super().__init__(config)
-        self.register_buffer("frames_nm", torch.zeros(config.n_frames, config.n_atoms, 3))
+        self.frames_nm = nn.Buffer(torch.zeros(config.n_frames, config.n_atoms, 3))
 
     def noise_shape(self, n_atoms: int) -> tuple[int, ...]:
         return (self.n_new,)
@@ -123,17 +116,14 @@ class NormalModes(Baseline):
 
     arch: ClassVar[str] = "normal-modes"
     fitted: ClassVar[bool] = True
-    conditions_on: ClassVar[int] = 2
-    mean_nm: Tensor
-    modes: Tensor
-    coefficients: Tensor
+    n_conditioning = 2
 
     def __init__(self, config: BaselineConfig) -> None:
         super().__init__(config)
-        self.register_buffer("mean_nm", torch.zeros(config.n_atoms, 3))
+        self.mean_nm = nn.Buffer(torch.zeros(config.n_atoms, 3))
         # Orthonormal rows (n_modes, 3 n_atoms), and a, b, s of each.
-        self.register_buffer("modes", torch.zeros(config.n_modes, 3 * config.n_atoms))
-        self.register_buffer("coefficients", torch.zeros(3, config.n_modes))
+        self.modes = nn.Buffer(torch.zeros(config.n_modes, 3 * config.n_atoms))
+        self.coefficients = nn.Buffer(torch.zeros(3, config.n_modes))
 
     def noise_shape(self, n_atoms: int) -> tuple[int, ...]:
         return (self.n_new, self.config.n_modes)
@@ -160,20 +150,15 @@ class MarkovStateModel(Baseline):
     arch: ClassVar[str] = "msm"
     fitted: ClassVar[bool] = True
     leaps: ClassVar[bool] = True
-    centres_nm: Tensor
-    cumulative: Tensor
-    frames_nm: Tensor
-    first: Tensor
-    heavy: Tensor
 
     def __init__(self, config: BaselineConfig) -> None:
         super().__init__(config)
-        self.register_buffer("centres_nm", torch.zeros(config.n_states, config.n_atoms, 3))
-        self.register_buffer("cumulative", torch.zeros(config.n_states, config.n_states))
-        self.register_buffer("frames_nm", torch.zeros(config.n_frames, config.n_atoms, 3))
-        self.register_buffer("first", torch.zeros(config.n_states + 1, dtype=torch.int64))
+        self.centres_nm = nn.Buffer(torch.zeros(config.n_states, config.n_atoms, 3))
+        self.cumulative = nn.Buffer(torch.zeros(config.n_states, config.n_states))
+        self.frames_nm = nn.Buffer(torch.zeros(config.n_frames, config.n_atoms, 3))
+        self.first = nn.Buffer(torch.zeros(config.n_states + 1, dtype=torch.int64))
         # One of the atoms that tell states apart, zero of the others.
-        self.register_buffer("heavy", torch.ones(config.n_atoms))
+        self.heavy = nn.Buffer(torch.ones(config.n_atoms))
 
     def noise_shape(self, n_atoms: int) -> tuple[int, ...]:
         return (self.n_new, 2)
@@ -206,8 +191,6 @@ def pick(noise: Tensor, n: Tensor) -> Tensor:
     return torch.minimum((share * n).long(), n - 1)
 
 
-# Fit baselines to reference frames and write them as weights, so that they roll out and are evaluated like any model.
-
 N_KEPT_FRAMES = 4000
 N_STATES = 100
 # Modes that move less than this have no motion to model (a tenth of the frames' int16 unit).
@@ -216,10 +199,8 @@ FloatArray = npt.NDArray[np.float64]
 
 
 def fit_baseline(arch: str, frames: TrainingFrames, out: str | Path, *, n_new: int = 16, seed: int = 0) -> Path:
-    """Fit the baseline called `arch` on the training part of `frames` and write `out` (.safetensors).
-
-    Raises InputError when the frames are not in the canonical pose that the baseline needs, or too few.
-    """
+    """Fit the baseline called `arch` on the training part of `frames` and write `out` (.safetensors). Raises InputError
+    when the frames are not in the canonical pose that the baseline needs, or too few."""
     (kind,) = (b for b in FITS if b.arch == arch)
     if kind.fitted and not frames.canonical:
         raise InputError(f"{arch} is fitted to canonical frames; make the windows without `canonical=False`.")

@@ -53,19 +53,19 @@ def gelu(x: Tensor) -> Tensor:
     return F.gelu(x.contiguous()) if x.dtype == torch.bfloat16 else F.gelu(x, approximate="tanh")
 
 
-def attend(q: Tensor, k: Tensor, v: Tensor, mask: Tensor | None = None) -> Tensor:
-    """Softmax attention: queries `(..., n, head_dim)`, keys and values `(..., m, head_dim)`; `mask` True where allowed,
-    or numbers that are added to the scores.
+def attend(q: Tensor, k: Tensor, v: Tensor, bias: Tensor | None = None) -> Tensor:
+    """Softmax attention: queries `(..., n, head_dim)`, keys and values `(..., m, head_dim)`; `bias` is added to the
+    scores.
 
     On a CPU the plain products are preferred for short sequences, as in a chunk of 32 frames: torch's fused kernel was
     the largest item in a profile of training.
     """
     if q.device.type != "cpu" or k.shape[-2] > _SHORT:
-        return F.scaled_dot_product_attention(q, k, v, attn_mask=mask)
+        return F.scaled_dot_product_attention(q, k, v, attn_mask=bias)
     q, k, v = q.contiguous(), k.contiguous(), v.contiguous()
     scores = (q @ k.transpose(-1, -2)) * q.shape[-1] ** -0.5
-    if mask is not None:
-        scores = scores.masked_fill(~mask, -math.inf) if mask.dtype == torch.bool else scores + mask
+    if bias is not None:
+        scores = scores + bias
     # Rows that are no multiple of 32 take five times as long in bf16.
     return torch.softmax(scores, -1, dtype=torch.float32).to(v.dtype) @ v
 
@@ -73,12 +73,10 @@ def attend(q: Tensor, k: Tensor, v: Tensor, mask: Tensor | None = None) -> Tenso
 class TimeEmbedding(nn.Module):
     """Sinusoidal embedding of the flow time in [0, 1] followed by a two-layer MLP: `(batch,)` -> `(batch, width)`."""
 
-    frequency: Tensor
-
-    def __init__(self, width: int, n_frequencies: int = 64) -> None:
+    def __init__(self, width: int) -> None:
         super().__init__()
-        self.register_buffer("frequency", torch.exp(torch.linspace(0.0, math.log(1000.0), n_frequencies)))
-        self.net = nn.Sequential(nn.Linear(2 * n_frequencies, width), nn.SiLU(), nn.Linear(width, width))
+        self.frequency = nn.Buffer(torch.exp(torch.linspace(0.0, math.log(1000.0), 64)))
+        self.net = nn.Sequential(nn.Linear(2 * 64, width), nn.SiLU(), nn.Linear(width, width))
 
     def forward(self, tau: Tensor) -> Tensor:
         angles = tau.float()[:, None] * self.frequency
@@ -93,11 +91,11 @@ class ParallelBlock(nn.Module):
     small; the gate's offset starts at zero, so a fresh block is the identity.
     """
 
-    def __init__(self, width: int, n_heads: int, mlp_ratio: int = 4) -> None:
+    def __init__(self, width: int, n_heads: int) -> None:
         super().__init__()
         if width % n_heads or (width // n_heads) % 2:
             raise ValueError(f"width {width} does not split into {n_heads} heads of even size")
-        self.n_heads, self.width, self.hidden = n_heads, width, mlp_ratio * width
+        self.n_heads, self.width, self.hidden = n_heads, width, 4 * width
         self.proj_in = nn.Linear(width, 3 * width + self.hidden)
         self.attention_out = nn.Linear(width, width, bias=False)
         self.mlp_out = nn.Linear(self.hidden, width)
@@ -142,9 +140,7 @@ class CrossAttentionBlock(nn.Module):
     context vectors; when there are few of them, only a gate lets each query read its own components of one vector.
     """
 
-    def __init__(
-        self, width: int, context: int, n_heads: int, head_dim: int, mlp_ratio: int = 4, *, gated: bool = False
-    ) -> None:
+    def __init__(self, width: int, context: int, n_heads: int, head_dim: int, *, gated: bool = False) -> None:
         super().__init__()
         self.n_heads = n_heads
         self.gate = nn.Linear(width, n_heads * head_dim) if gated else None
@@ -152,24 +148,17 @@ class CrossAttentionBlock(nn.Module):
         self.q = nn.Linear(width, n_heads * head_dim)
         self.kv = nn.Linear(context, 2 * n_heads * head_dim)
         self.out = nn.Linear(n_heads * head_dim, width)
-        self.mlp = nn.Sequential(
-            nn.LayerNorm(width),
-            nn.Linear(width, mlp_ratio * width),
-            nn.GELU(approximate="tanh"),
-            nn.Linear(mlp_ratio * width, width),
-        )
+        wide = (nn.Linear(width, 4 * width), nn.GELU(approximate="tanh"), nn.Linear(4 * width, width))
+        self.mlp = nn.Sequential(nn.LayerNorm(width), *wide)
 
-    def forward(self, x: Tensor, context: Tensor, key_mask: Tensor | None = None) -> Tensor:
-        """`key_mask` (b, m) is True where the context holds a real entity."""
+    def forward(self, x: Tensor, context: Tensor) -> Tensor:
         normed = self.norm(x)
         k, v = self.kv(context).chunk(2, dim=-1)
-        if context.shape[-2] == 1 and key_mask is None:
+        if context.shape[-2] == 1:
             attended = v  # attention over a single key returns its value
         else:
             split = lambda t: t.unflatten(-1, (self.n_heads, -1)).transpose(1, 2)  # noqa: E731
-            mask = None if key_mask is None else key_mask[:, None, None, :]
-            attended = attend(split(self.q(normed)), split(k), split(v), mask)
-            attended = attended.transpose(1, 2).flatten(-2)
+            attended = attend(split(self.q(normed)), split(k), split(v)).transpose(1, 2).flatten(-2)
         if self.gate is not None:
             attended = attended * self.gate(normed)
         x = x + self.out(attended)
@@ -217,7 +206,6 @@ def _has_lean_form(module: nn.Module) -> bool:
 class PackedLinear(nn.Module):
     """`torch.nn.Linear`, its weight packed where it is bf16 and torch has oneDNN; elsewhere plain."""
 
-    weight: Tensor
     bias: Tensor | None
 
     def __init__(self, weight: Tensor, bias: Tensor | None) -> None:
@@ -227,7 +215,7 @@ class PackedLinear(nn.Module):
         self.packed = weight.dtype == torch.bfloat16 and _can_pack()
         weight = weight.detach().contiguous()
         packed = torch.ops.mkldnn._reorder_linear_weight(weight, _ROWS) if self.packed else weight
-        self.register_buffer("weight", packed, persistent=False)
+        self.weight = nn.Buffer(packed, persistent=False)
         self.register_buffer("bias", None if bias is None else bias.detach().contiguous(), persistent=False)
 
     def forward(self, x: Tensor) -> Tensor:
@@ -235,14 +223,11 @@ class PackedLinear(nn.Module):
         if not self.packed:
             return F.linear(x, self.weight, self.bias)
         multiply = torch.ops.mkldnn._linear_pointwise.default
-        out: Tensor = multiply(x.to(self.dtype), self.weight, self.bias, "none", [], "")
-        return out
+        return cast(Tensor, multiply(x.to(self.dtype), self.weight, self.bias, "none", [], ""))
 
 
 class LeanBlock(nn.Module):
     """`ParallelBlock` as it is evaluated; keys that it returns are in its own order of numbers, for itself."""
-
-    offset: Tensor
 
     def __init__(self, block: ParallelBlock) -> None:
         super().__init__()
@@ -256,7 +241,7 @@ class LeanBlock(nn.Module):
         self.proj_in = PackedLinear(weight[order], bias[order])
         self.attention_out = PackedLinear(block.attention_out.weight, None)
         self.mlp_out = PackedLinear(block.mlp_out.weight, block.mlp_out.bias)
-        self.register_buffer("offset", block.offset.detach().clone(), persistent=False)
+        self.offset = nn.Buffer(block.offset.detach().clone(), persistent=False)
 
     def forward(
         self, x: Tensor, modulation: Tensor, rope: tuple[Tensor, Tensor] | None, past: KeysValues | None = None,
@@ -297,18 +282,16 @@ class LeanBlock(nn.Module):
 class LeanCrossBlock(nn.Module):
     """`CrossAttentionBlock` as it is evaluated: of few vectors, all heads read in one product."""
 
-    own_head: Tensor
-
     def __init__(self, block: CrossAttentionBlock) -> None:
         super().__init__()
         self.block = block
-        self.register_buffer("own_head", torch.eye(block.n_heads)[None, None, :, :, None], persistent=False)
+        self.own_head = nn.Buffer(torch.eye(block.n_heads)[None, None, :, :, None], persistent=False)
 
-    def forward(self, x: Tensor, context: Tensor, key_mask: Tensor | None = None) -> Tensor:
+    def forward(self, x: Tensor, context: Tensor) -> Tensor:
         """See `CrossAttentionBlock.forward`; `x` may be one row (1, n, width) for all of the context."""
         block = self.block
-        if key_mask is not None or not 1 < context.shape[-2] <= _FEW:
-            return cast(Tensor, block(x, context, key_mask))
+        if not 1 < context.shape[-2] <= _FEW:
+            return cast(Tensor, block(x, context))
         normed = block.norm(x)
         k, v = block.kv(context).chunk(2, dim=-1)
         attended = self._read(block.q(normed), k, v)
@@ -334,8 +317,6 @@ class LeanCrossBlock(nn.Module):
 
 
 class _Gelu(nn.Module):
-    """`gelu`."""
-
     def forward(self, x: Tensor) -> Tensor:
         return gelu(x)
 
@@ -345,16 +326,12 @@ def _can_pack() -> bool:
     return torch.backends.mkldnn.is_available() and hasattr(torch.ops.mkldnn, "_reorder_linear_weight")
 
 
-# A model's networks compiled by torch: faster chunks, after a minute of compiling.
-
-
 def with_compiled_parts(model: _Model) -> _Model:
-    """Return a copy whose networks are compiled when they are first called, for arrays of one shape.
+    """Return a copy whose networks are compiled by torch when they are first called, for arrays of one shape; parts
+    that are not called as a network, such as encoder and decoder, are the lean ones.
 
-    Weights become constants of what is compiled (freezing), which packs them as the processor multiplies them: for a
-    single replica an evaluation takes a quarter to a half less time. What torch compiles it keeps on disk for the next
-    process. Parts that are not called as a network, such as encoder and decoder, are the lean ones.
-    Raises InputError where there is no C++ compiler.
+    Weights become constants of what is compiled (freezing): for a single replica an evaluation takes a quarter to a
+    half less time. Raises InputError where there is no C++ compiler.
     """
     if not any(shutil.which(name) for name in (os.environ.get("CXX") or "g++", "clang++")):
         raise InputError("compiling needs a C++ compiler (g++ or clang++), which is not on the PATH; leave it out.")

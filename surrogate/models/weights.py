@@ -12,7 +12,7 @@ from typing import Any
 
 import torch
 
-from surrogate.data.frames import TrainingFrames
+from surrogate.data import TrainingFrames
 from surrogate.models.architecture import architecture
 from surrogate.models.propagator import Propagator
 from surrogate.training.loop import save_tensors, tensor_checksum
@@ -102,13 +102,11 @@ class Header:
 def _check_sizes(config: Any, n_tensors: int, n_values: int) -> None:
     """Raise ValueError for more layers than a file has tensors, or a size beyond that of all of them, before any is
     made."""
-    entries = config.items() if isinstance(config, dict) else enumerate(config)
-    for key, value in entries:
+    for key, value in config.items() if isinstance(config, dict) else enumerate(config):
+        most = n_tensors if str(key).endswith(("layers", "rounds")) else n_values
         if isinstance(value, dict | list):
             _check_sizes(value, n_tensors, n_values)
-        elif isinstance(value, int | float) and not abs(value) <= (
-            n_tensors if str(key).endswith(("layers", "rounds")) else n_values
-        ):
+        elif isinstance(value, int | float) and not abs(value) <= most:
             raise ValueError(f"{key} = {value!r} in a file of {n_tensors} tensors with {n_values} numbers")
 
 

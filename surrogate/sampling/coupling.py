@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
-from surrogate.data.frames import fitted_atoms
+from surrogate.data import fitted_atoms
 from surrogate.models.potential import Potential
 from surrogate.models.propagator import Molecule
 from systems.chemistry.geometry import superposition

@@ -17,29 +17,18 @@ import numpy.typing as npt
 import torch
 
 from surrogate.models.potential import Potential
-from surrogate.sampling.chunks import ChunkSampler, noise_seed
-from surrogate.sampling.config import RolloutConfig
+from surrogate.sampling.chunks import Chunk, ChunkSampler, Guard, Interventions, Tally, noise_seed, none_through
+from surrogate.sampling.config import RolloutConfig as RolloutConfig
 from surrogate.sampling.coupling import Coupling, EnergyCheck, MemberSpread, ReferenceDifference, RelaxedEnergy
 from surrogate.sampling.domain import DomainMatch, fit_weights, in_bath
-from surrogate.sampling.interventions import Chunk, Clock, Guard, Interventions, Tally, none_through
 from systems.chemistry.validity import INVALID, Geometry, check_frames
 from systems.errors import InputError, SimulationError, first_line
 from systems.files.outside import UNREADABLE, arrays_in, check_disk
 from systems.files.schema import built
 from systems.interrupts import deferred_interrupt
 from systems.scene import Scene, part_of, select_atoms
+from systems.trajectory import checkpoint
 from systems.trajectory.base import TrajectoryWriter
-from systems.trajectory.checkpoint import (
-    FLUSH_SHARE,
-    Checkpoint,
-    checkpoint_path,
-    locked_outputs,
-    new_header,
-    read_checkpoint,
-    supported_checkpoint,
-    write_checkpoint,
-    writer_at,
-)
 from systems.trajectory.codec import open_trajectory
 from systems.units import format_time_ps, whole_steps
 
@@ -144,7 +133,7 @@ def packed_progress(progress: Progress) -> tuple[dict[str, Any], bytes]:
     return plain, buffer.getvalue()
 
 
-def progress_of(path: Path, state: Checkpoint, settings: dict[str, Any] | None) -> Progress:
+def progress_of(path: Path, state: checkpoint.Checkpoint, settings: dict[str, Any] | None) -> Progress:
     """Return where a rollout of these settings stood, or of any (None), by one state in its checkpoint `path`.
 
     Raises InputError when it cannot be read, or the rollout was started with other settings.
@@ -286,7 +275,7 @@ def rollout(
 
     Frames stand at save_every_ps, 2 save_every_ps, ... up to time_ps, in the scene's own atom order and pose, each
     marked with its chunk, its validity flags (systems.chemistry.validity) against the training reference, and what was
-    done about it (column `intervention`, `interventions.MARKS`), of which the record holds a summary. Replica k draws
+    done about it (column `intervention`, `chunks.MARKS`), of which the record holds a summary. Replica k draws
     chunk c's noise from a generator seeded by (seed, k, c), so a replica does not depend on how many run beside it, and
     a resumed rollout continues as if it had not stopped. Ctrl-C and SIGTERM stop between two chunks, with everything on
     disk: KeyboardInterrupt. Memory that does not suffice for all replicas at once halves the batch. `announce` gets
@@ -301,11 +290,11 @@ def rollout(
     if announce is not None:
         for line in match.input_notes(weights.path.name):
             announce(line)
-    state_path = checkpoint_path(outs[0])
+    state_path = checkpoint.checkpoint_path(outs[0])
     precision = config.precision
     if resume and precision == "auto" and state_path.exists():
         # A rollout that goes on keeps it, whatever another processor would choose.
-        precision = "bf16" if read_checkpoint(state_path)[0]["settings"]["bf16"] else "fp32"
+        precision = "bf16" if checkpoint.read_checkpoint(state_path)[0]["settings"]["bf16"] else "fp32"
     sampler = ChunkSampler(
         weights, solver_steps=config.solver_steps, solver=config.solver, precision=precision, compile=config.compile
     )
@@ -315,15 +304,15 @@ def rollout(
 
     with ExitStack() as stack:
         asked_to_stop = stack.enter_context(deferred_interrupt())
-        stack.enter_context(locked_outputs(outs, may_exist=resume or overwrite))
+        stack.enter_context(checkpoint.locked_outputs(outs, may_exist=resume or overwrite))
         if resume and not state_path.exists() and any(path.exists() for path in outs):
             return _already_complete(outs, plan)
-        kept = supported_checkpoint(state_path, outs) if resume and state_path.exists() else None
+        kept = checkpoint.supported_checkpoint(state_path, outs) if resume and state_path.exists() else None
         if kept is None:
             state = _start(plan, sampler, len(outs), asked_to_stop)
         else:
             state = progress_of(state_path, kept, plan.settings)
-        header = kept[0] if kept else new_header(len(outs), overwrite=overwrite)
+        header = kept[0] if kept else checkpoint.new_header(len(outs), overwrite=overwrite)
         if plan.n_frames < header.get("n_frames_wanted", 0):
             raise InputError(
                 f"{outs[0]} was started for {header['n_frames_wanted']} frames and cannot become shorter; resume with "
@@ -331,7 +320,6 @@ def rollout(
             )
         header |= {"settings": plan.settings, "n_frames_wanted": plan.n_frames}
         sampler.batch, sampler.drawn, sampler.evaluations = state.batch, state.drawn, state.evaluations
-        clock = Clock(state.seconds)
         coupling = None
         if config.needs_openmm:
             coupling = Coupling(weights)
@@ -340,12 +328,12 @@ def rollout(
         energy: EnergyCheck | None = None
         if config.energy_every and coupling is not None:
             energy = ReferenceDifference(coupling, weights) if learned else RelaxedEnergy(coupling)
-        engine = Interventions(sampler, checks, config.guard, config.seed, clock, coupling, config.energy_every,
+        engine = Interventions(sampler, checks, config.guard, config.seed, state.seconds, coupling, config.energy_every,
                                plan.n_between, energy, MemberSpread(weights) if learned else None)  # fmt: skip
 
         def save() -> None:
             header["progress"], arrays = packed_progress(state)
-            write_checkpoint(state_path, header, arrays)
+            checkpoint.write_checkpoint(state_path, header, arrays)
 
         if not state.steps:
             # Before there are files, so that a rollout killed at any later moment can be gone on with.
@@ -354,7 +342,7 @@ def rollout(
         writers: list[TrajectoryWriter] = []
         for k, path in enumerate(outs):
             record = new_record(plan, sampler, checks, replica=k)
-            opened = writer_at(path, part, record, header, k, resumed=kept is not None)
+            opened = checkpoint.writer_at(path, part, record, header, k, resumed=kept is not None)
             writers.append(stack.enter_context(opened))
         buffers: list[list[Block]] = [[] for _ in outs]
         started = time.monotonic() - state.wall_s
@@ -392,7 +380,7 @@ def rollout(
             _buffer(plan, state, chunk, buffers)
             _move_on(state, chunk, sampler)
             complete, stopping = state.steps >= plan.n_steps, asked_to_stop()
-            pause_s = max(flush_every_s, FLUSH_SHARE * flushed_s if flush_every_s else 0.0)
+            pause_s = max(flush_every_s, checkpoint.FLUSH_SHARE * flushed_s if flush_every_s else 0.0)
             if complete or stopping or time.monotonic() - flushed_at > pause_s:
                 flush()
             if progress is not None:

@@ -24,6 +24,7 @@ from systems.errors import InputError, SimulationError, first_line
 from systems.files.outside import UNREADABLE, arrays_in
 from systems.files.schema import parsed
 from systems.files.whole_file import create_whole
+from systems.library.named_scenes import prepare
 from systems.options import from_field, options_as_keywords
 from systems.scene import Scene
 
@@ -168,7 +169,9 @@ class Simulation:
         import openmm
         from openmm import unit
 
-        scene, weights = _given(scene, weights)
+        if isinstance(scene, str | Path):
+            scene = prepare(str(scene))
+        weights = _loaded(weights)
         weights, match = fit_weights(scene, weights, force=options.force, lag_ps=options.lag_ps)
         self.scene, self.weights, self.deviations = scene, weights, match.deviations
         self.energy_fn = energy_fn
@@ -371,14 +374,6 @@ _PROPERTIES = {
     "positions", "velocities", "forces", "energy", "parameters", "parameterderivatives", "integratorparameters",
     "enforceperiodicbox", "groups",
 }  # fmt: skip
-
-
-def _given(scene: str | Path | Scene, weights: str | Path | Weights) -> tuple[Scene, Weights]:
-    if isinstance(scene, str | Path):
-        from systems.library.named_scenes import prepare
-
-        scene = prepare(str(scene))
-    return scene, _loaded(weights)
 
 
 def _loaded(weights: str | Path | Weights) -> Weights:

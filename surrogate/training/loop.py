@@ -18,14 +18,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor, nn
 
-from surrogate.training.devices import (
-    average_gradients,
-    bf16_pays,
-    is_first_process,
-    keep_freed_memory,
-    open_fabric,
-    wait_for_all,
-)
+from surrogate.training import devices
 from systems.errors import InputError, SimulationError, first_line
 from systems.files.schema import built, parsed
 from systems.files.whole_file import create_whole
@@ -306,9 +299,9 @@ def run_stage(
     Of several processes (training.devices) each draws its own batches, and the first alone validates and writes.
     Raises SimulationError when the loss stops being finite; the last saved state stays.
     """
-    keep_freed_memory()
+    devices.keep_freed_memory()
     device = place.device
-    fabric = open_fabric(device.type, config.bf16 and bf16_pays(device.type))
+    fabric = devices.open_fabric(device.type, config.bf16 and devices.bf16_pays(device.type))
     optimisers = optimisers_of(module, config)
     rates = [[group["lr"] for group in optimiser.param_groups] for optimiser in optimisers]
     ema = Ema(module, config.ema_decay)
@@ -334,7 +327,7 @@ def run_stage(
         loss.backward()
         now = time.monotonic()
         # The first process's clock decides for all when to validate and to end.
-        spent_s, last = average_gradients(fabric, module, spent_s + now - last), now
+        spent_s, last = devices.average_gradients(fabric, module, spent_s + now - last), now
         norm = nn.utils.clip_grad_norm_(module.parameters(), config.clip_norm)
         if not torch.isfinite(norm):
             raise SimulationError(
@@ -397,15 +390,15 @@ def train_stages(
     """Train stage after stage and write the weights `out`; beside them stand a CSV of the curves and, until all is
     done, the state of each stage (NAME.STAGE.train.safetensors), from which `resume` goes on.
 
-    The next stage is asked for when one has ended, so that a generator may prepare it from what that has learned, and
-    do what is left to do after the last. `write(spent_s)` writes the weights, given the seconds of training of each
-    stage so far. Of several processes the first alone writes. Raises SimulationError when a loss stops being finite.
+    The next stage is asked for when one has ended: a generator may prepare it from what that has learned, and do what
+    is left to do after the last. `write(spent_s)` writes the weights, given the seconds of training of each stage so
+    far; of several processes the first alone calls it. Raises SimulationError when a loss stops being finite.
     """
     log, spent_s = out.with_suffix(".csv"), list[float]()
     own = re.compile(re.escape(out.stem) + r"\.[^.]+\.train\.safetensors")
 
     def forget(*more: Path) -> None:
-        if is_first_process():
+        if devices.is_first_process():
             for path in (*more, *(path for path in out.parent.iterdir() if own.fullmatch(path.name))):
                 path.unlink(missing_ok=True)
 
@@ -428,10 +421,10 @@ def train_stages(
                 on_save=save if stage.saves else None,
             )
         )
-    if is_first_process():
+    if devices.is_first_process():
         write(spent_s)
     forget()
-    wait_for_all()
+    devices.wait_for_all()
 
 
 def optimisers_of(module: nn.Module, config: StageConfig) -> list[torch.optim.Optimizer]:

@@ -19,7 +19,7 @@ from systems.files.whole_file import OutputLock
 from systems.options import options_as_keywords
 
 if TYPE_CHECKING:
-    from surrogate.data.references import References
+    from surrogate.data import References
     from surrogate.models.architecture import Choice, Trainer, TrainingRequest
 
 
@@ -171,7 +171,7 @@ def _device(name: str) -> str:
 def _plan(references: Trajectories, validation: Trajectories | None, asked: TrainingRequest, *,
           explained: bool = False) -> _Plan:  # fmt: skip
     """Find the references and choose what is not asked for."""
-    from surrogate.data.references import References
+    from surrogate.data import References
 
     if asked.arch:
         _check_start(asked)

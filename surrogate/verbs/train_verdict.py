@@ -180,7 +180,7 @@ def _roll(weights: Weights) -> _Rolled:
 def _count(found: _Rolled, path: Path, domain: TrainingDomain) -> None:
     import numpy as np
 
-    from surrogate.sampling.interventions import caught
+    from surrogate.sampling.chunks import caught
     from systems.chemistry.validity import flag_names
     from systems.trajectory.codec import open_trajectory
 

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from surrogate.models.weights import Weights, load_weights
-from surrogate.sampling.interventions import Tally
+from surrogate.sampling.chunks import Tally
 from surrogate.sampling.runner import Progress, packed_progress, progress_of
 from surrogate.sampling.simulation import Simulation
 from systems.errors import SurromdError

@@ -21,8 +21,8 @@ from forecasters import (
 )
 from painet_modes import ModalConfig, ModalEgnn, ModalPainet
 
-from surrogate.data.frames import TrainingFrames, quantise
-from surrogate.models.painet.trainer import PainetTraining
+from surrogate.data import TrainingFrames, quantise
+from surrogate.models.painet.model import PainetTraining
 from systems.errors import InputError
 from systems.scene import Scene
 

@@ -35,10 +35,9 @@ from integrator import cut
 from painet_modes import ModalConfig, ModalEgnn, ModalPainet
 from safetensors.torch import load_file
 
-from surrogate.data.frames import TrainingFrames, collect_frames
+from surrogate.data import TrainingFrames, collect_frames
 from surrogate.models.conformance import branched_chain, random_state
-from surrogate.models.painet.model import Painet, PainetConfig
-from surrogate.models.painet.trainer import PainetTraining, StateWindows, for_frames, train_painet
+from surrogate.models.painet.model import Painet, PainetConfig, PainetTraining, StateWindows, for_frames, train_painet
 from surrogate.models.weights import read_header
 from systems.errors import InputError
 

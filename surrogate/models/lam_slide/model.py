@@ -12,16 +12,9 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from surrogate.models import layers
 from surrogate.models.architecture import ModelConfig
 from surrogate.models.lam_slide import flow
-from surrogate.models.layers import (
-    CrossAttentionBlock,
-    KeysValues,
-    ParallelBlock,
-    TimeEmbedding,
-    fourier_features,
-    rotary_angles,
-)
 from surrogate.models.propagator import Chunk, Molecule, Propagator
 from systems.errors import InputError
 
@@ -129,31 +122,30 @@ class Autoencoder(nn.Module):
         # Identifiers bind to coordinates by a product, so that a sum over atoms can be taken apart again.
         self.embed_coordinates = nn.Linear(coordinate_dim, c.width)
         self.embed_entity = nn.Linear(16 + c.identifier_dim, 2 * c.width)
-        self.embed = nn.Sequential(
-            nn.Linear(c.width, c.width), nn.GELU(approximate="tanh"), nn.Linear(c.width, c.width)
-        )
+        dense = (nn.Linear(c.width, c.width), nn.GELU(approximate="tanh"), nn.Linear(c.width, c.width))
+        self.embed = nn.Sequential(*dense)
         self.queries = nn.Parameter(torch.randn(c.n_latents, c.width) * 0.5)
         self.encoder = nn.ModuleList(
-            CrossAttentionBlock(c.width, c.width, c.n_heads, c.head_dim) for _ in range(c.n_encoder_layers)
+            layers.CrossAttentionBlock(c.width, c.width, c.n_heads, c.head_dim) for _ in range(c.n_encoder_layers)
         )
         self.to_latent = nn.Linear(c.width, c.latent_dim)
         self.query = nn.Linear(c.identifier_dim, c.width)
         self.decoder = nn.ModuleList(
-            CrossAttentionBlock(c.width, c.latent_dim, c.n_heads, c.head_dim, gated=True)
+            layers.CrossAttentionBlock(c.width, c.latent_dim, c.n_heads, c.head_dim, gated=True)
             for _ in range(c.n_decoder_layers)
         )
         self.to_position = nn.Sequential(nn.LayerNorm(c.width), nn.Linear(c.width, 3))
         self.to_element = nn.Sequential(nn.LayerNorm(c.width), nn.Linear(c.width, MAX_ATOMIC_NUMBER + 1))
 
-    def encode(self, x: Tensor, elements: Tensor, identifiers: Tensor, mask: Tensor | None = None) -> Tensor:
+    def encode(self, x: Tensor, elements: Tensor, identifiers: Tensor) -> Tensor:
         """Positions `(b, n, 3)` (scaled), atomic numbers and identifiers `(b, n)` -> latents `(b, n_latents, dim)`."""
         entity = self.embed_entity(torch.cat([self.elements(elements), self.identifiers(identifiers)], dim=-1))
         scale, shift = entity.chunk(2, dim=-1)
-        tokens = self.embed_coordinates(fourier_features(x, self.config.n_octaves)) * scale + shift
+        tokens = self.embed_coordinates(layers.fourier_features(x, self.config.n_octaves)) * scale + shift
         tokens = tokens + self.embed(tokens)
         latents = self.queries.expand(x.shape[0], -1, -1)
         for block in self.encoder:
-            latents = block(latents, tokens, mask)
+            latents = block(latents, tokens)
         z = self.to_latent(latents).float()
         return F.layer_norm(z, (self.config.latent_dim,))
 
@@ -186,19 +178,17 @@ def reconstruction_losses(x: Tensor, decoded: Tensor) -> tuple[Tensor, Tensor]:
 
 Rope = tuple[Tensor, Tensor]
 # Keys and values of the conditioning frames, layer by layer.
-Memory = list[KeysValues]
+Memory = list[layers.KeysValues]
 
 
 class LagEmbedding(nn.Module):
     """How far apart frames are to be: the place of the lag's logarithm in the trained range, in waves long enough that
     between two trained lags nothing but a smooth line can be learned."""
 
-    frequency: Tensor
-
     def __init__(self, width: int, lag_range_ps: tuple[float, float]) -> None:
         super().__init__()
         self.lag_range_ps = lag_range_ps
-        self.register_buffer("frequency", math.pi * torch.tensor([0.5, 1.0, 2.0, 3.0]), persistent=False)
+        self.frequency = nn.Buffer(math.pi * torch.tensor([0.5, 1.0, 2.0, 3.0]), persistent=False)
         self.of_lag = nn.Sequential(nn.Linear(9, width), nn.SiLU(), nn.Linear(width, width))
 
     def forward(self, lag_ps: Tensor) -> Tensor:
@@ -215,12 +205,12 @@ class LatentLayer(nn.Module):
 
     def __init__(self, width: int, n_heads: int, n_latents: int) -> None:
         super().__init__()
-        self.spatial = ParallelBlock(width, n_heads) if n_latents > 1 else None
-        self.temporal = ParallelBlock(width, n_heads)
+        self.spatial = layers.ParallelBlock(width, n_heads) if n_latents > 1 else None
+        self.temporal = layers.ParallelBlock(width, n_heads)
 
     def forward(
-        self, o: Tensor, modulation: Tensor, rope_latent: Rope, rope_time: Rope, past: KeysValues | None = None
-    ) -> tuple[Tensor, KeysValues]:
+        self, o: Tensor, modulation: Tensor, rope_latent: Rope, rope_time: Rope, past: layers.KeysValues | None = None
+    ) -> tuple[Tensor, layers.KeysValues]:
         """`o` (b, L, T, width), `modulation` (b, 6, width): three for each block; `past` of earlier frames."""
         if self.spatial is not None:
             o = self.spatial(o.transpose(1, 2), modulation[:, :3], rope_latent)[0].transpose(1, 2)
@@ -229,11 +219,6 @@ class LatentLayer(nn.Module):
 
 class Approximator(nn.Module):
     """Data prediction network: noisy latents of a chunk, flow time, conditioning latents -> clean latents."""
-
-    cos_time: Tensor
-    sin_time: Tensor
-    cos_latent: Tensor
-    sin_latent: Tensor
 
     def __init__(self, config: ApproximatorConfig, n_latents: int, latent_dim: int) -> None:
         super().__init__()
@@ -246,7 +231,7 @@ class Approximator(nn.Module):
         self.embed_conditioning = nn.Linear(latent_dim, c.width)
         self.embed_mask = nn.Embedding(2, c.width)
         self.embed_latent = nn.Parameter(torch.randn(n_latents, c.width) * 0.02)
-        self.embed_time = TimeEmbedding(c.width)
+        self.embed_time = layers.TimeEmbedding(c.width)
         self.layers = nn.ModuleList(LatentLayer(c.width, c.n_heads, n_latents) for _ in range(c.n_layers))
         self.modulation = nn.Linear(c.width, 6 * c.width)
         self.final_modulation = nn.Linear(c.width, 2 * c.width)
@@ -256,10 +241,9 @@ class Approximator(nn.Module):
             nn.init.zeros_(module.weight)
             nn.init.zeros_(module.bias)
         head_dim = c.width // c.n_heads
-        for name, length in (("time", c.chunk_frames), ("latent", n_latents)):
-            angles = rotary_angles(length, head_dim)
-            self.register_buffer(f"cos_{name}", angles.cos(), persistent=False)
-            self.register_buffer(f"sin_{name}", angles.sin(), persistent=False)
+        of_time, of_latent = (layers.rotary_angles(n, head_dim) for n in (c.chunk_frames, n_latents))
+        self.cos_time, self.sin_time = (nn.Buffer(x, persistent=False) for x in (of_time.cos(), of_time.sin()))
+        self.cos_latent, self.sin_latent = (nn.Buffer(x, persistent=False) for x in (of_latent.cos(), of_latent.sin()))
 
     def forward(
         self, o: Tensor, tau: Tensor, conditioning: Tensor, memory: Memory | None = None, lag: Tensor | None = None
@@ -316,7 +300,7 @@ class Approximator(nn.Module):
         h = self.embed_noisy(self._tokens(o)) + self.embed_mask.weight[0] + self.embed_latent
         return self._transform(h, time, n_known, memory).reshape(o.shape)
 
-    def _transform(self, h: Tensor, time: Tensor, first: int, past: Sequence[KeysValues | None]) -> Tensor:
+    def _transform(self, h: Tensor, time: Tensor, first: int, past: Sequence[layers.KeysValues | None]) -> Tensor:
         """Embedded frames `(b, T, L, width)`, of which the first has the place `first`, through all layers."""
         modulation, final_modulation = self._modulations(time)
         ropes = self._ropes(first, h.shape[1])
@@ -353,24 +337,19 @@ class LamSlide(Propagator):
     arch: ClassVar[str] = "lam-slide"
     float32_layers: tuple[str, ...] = ("autoencoder.to_position",)
     config: LamSlideConfig
-    latent_mean: Tensor
-    latent_scale: Tensor
 
     def __init__(self, config: LamSlideConfig) -> None:
         super().__init__()
         self.config = config
         self.solvers = flow.solvers_for(config.approximator.interpolant)
+        self.n_conditioning = config.approximator.n_conditioning
         n_latents, latent_dim = config.autoencoder.n_latents, config.autoencoder.latent_dim
         self.autoencoder = Autoencoder(config.autoencoder)
         self.approximator = Approximator(config.approximator, n_latents, latent_dim)
         # Spacing of the frames that `next_chunk` returns: the shortest of the range, until `at_lag` sets another.
         self.lag_ps = config.approximator.lag_range_ps[0] if config.approximator.lag_range_ps else None
-        self.register_buffer("latent_mean", torch.zeros(n_latents, latent_dim))
-        self.register_buffer("latent_scale", torch.ones(()))
-
-    @property
-    def n_conditioning(self) -> int:
-        return self.config.approximator.n_conditioning
+        self.latent_mean = nn.Buffer(torch.zeros(n_latents, latent_dim))
+        self.latent_scale = nn.Buffer(torch.ones(()))
 
     @property
     def n_new(self) -> int:

@@ -13,18 +13,8 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from surrogate.data.frames import TrainingFrames
-from surrogate.data.references import References, StrideSampler, Survey, strides_up_to
-from surrogate.models.architecture import (
-    AdvanceFn,
-    Architecture,
-    Choice,
-    Prepared,
-    Settings,
-    Suitability,
-    Trainer,
-    TrainingRequest,
-)
+from surrogate.data import References, StrideSampler, Survey, TrainingFrames, strides_up_to
+from surrogate.models import architecture as arch
 from surrogate.models.lam_slide import flow
 from surrogate.models.lam_slide.model import (
     AutoencoderConfig,
@@ -244,11 +234,6 @@ class TrainingConfig:
         return one, two
 
 
-def is_trained(out: Path) -> bool:
-    """Return whether `out` is there and no state of an interrupted training is beside it."""
-    return out.exists() and not list(out.parent.glob(f"{out.stem}.*.train.safetensors"))
-
-
 def train_lam_slide(
     frames: TrainingFrames,
     out: str | Path,
@@ -409,37 +394,37 @@ def _check_start(start: Weights, frames: TrainingFrames, model_config: LamSlideC
         raise InputError(f"{name} steps {of.lag_ps:g} ps from frame to frame; these trajectories {frames.lag_ps:g} ps.")
 
 
-# LaM-SLidE behind the verb `train`: choices for the references, settings, and the start of the training.
-
+REVERSIBLE = arch.Choice("training.time_reversal", True, "MD at constant temperature reads alike backwards")
 _RESOLVED = frozenset({"budget_s", "stage_one_steps", "stage_two_steps", "seed", "device"})
 
 
-class LamSlideTrainer(Trainer):
+class LamSlideTrainer(arch.Trainer):
     """Trains LaM-SLidE. One molecule at one spacing of frames gets the defaults if they hold its atoms."""
 
     goes_on = True
     learns_lags = True
 
-    def check(self, request: TrainingRequest) -> None:
+    def check(self, request: arch.TrainingRequest) -> None:
         """See `Trainer.check`."""
         super().check(request)
         if request.steps is not None and request.steps < 2:
             raise InputError("`steps` must be at least 2: one for each stage.")
 
-    def choose(self, references: References, request: TrainingRequest) -> tuple[Choice, ...]:
+    def choose(self, references: References, request: arch.TrainingRequest) -> tuple[arch.Choice, ...]:
         """See `Trainer.choose`."""
-        survey, found = references.survey, list[Choice]()
+        survey, found = references.survey, list[arch.Choice]()
         if request.start_from is not None:
             return ()
         pool = AutoencoderConfig.identifier_pool
         if "identifier_pool" not in request.model.get("autoencoder", {}) and (n := survey.scenes[0].n_atoms) > pool:
-            found.append(Choice("model.autoencoder.identifier_pool", n, f"{n} atoms, more than {pool} identifiers"))
+            why = f"{n} atoms, more than {pool} identifiers"
+            found.append(arch.Choice("model.autoencoder.identifier_pool", n, why))
         lags = request.longest_lag_ps or request.training.get("longest_lag_ps")
         if lags and survey.equilibrium and "time_reversal" not in request.training:
-            found.append(Choice("training.time_reversal", True, "MD at constant temperature reads alike backwards"))
+            found.append(REVERSIBLE)
         return tuple(found)
 
-    def settings(self, request: TrainingRequest) -> Settings:
+    def settings(self, request: arch.TrainingRequest) -> arch.Settings:
         """See `Trainer.settings`."""
         model = request.model if request.start_from is None else read_header(request.start_from).config
         steps, first = request.steps, None
@@ -454,9 +439,9 @@ class LamSlideTrainer(Trainer):
         }
         if request.longest_lag_ps is not None:
             asked["longest_lag_ps"] = request.longest_lag_ps
-        return Settings(LamSlideConfig.from_dict(model), request.settings(TrainingConfig, asked), _RESOLVED)
+        return arch.Settings(LamSlideConfig.from_dict(model), request.settings(TrainingConfig, asked), _RESOLVED)
 
-    def prepare(self, references: References, request: TrainingRequest) -> Prepared:
+    def prepare(self, references: References, request: arch.TrainingRequest) -> arch.Prepared:
         """See `Trainer.prepare`."""
         settings = self.settings(request)
         model: LamSlideConfig = settings.model
@@ -466,7 +451,7 @@ class LamSlideTrainer(Trainer):
             frames.window_starts(model.approximator.chunk_frames, validation=validation)
         share_one = 0.0 if start is not None else STAGE_ONE_SHARE
 
-        def run(advance: AdvanceFn) -> Path:
+        def run(advance: arch.AdvanceFn) -> Path:
             def report(stage: str, share: float, metrics: dict[str, float]) -> None:
                 advance(stage, share * share_one if stage == "autoencoder" else share_one + share * (1 - share_one))
 
@@ -474,11 +459,11 @@ class LamSlideTrainer(Trainer):
                 frames, request.out, model, settings.training, start=start, resume=request.resume, progress=report
             )
 
-        return Prepared(frames.scene.name, run)
+        return arch.Prepared(frames.scene.name, run)
 
 
-def _suits(survey: Survey) -> Suitability | None:
-    return Suitability(0, "one molecule") if survey.one_molecule else None
+def _suits(survey: Survey) -> arch.Suitability | None:
+    return arch.Suitability(0, "one molecule") if survey.one_molecule else None
 
 
-LAM_SLIDE = Architecture("lam-slide", LamSlideConfig.from_dict, LamSlide, LamSlideTrainer, _suits)
+LAM_SLIDE = arch.Architecture("lam-slide", LamSlideConfig.from_dict, LamSlide, LamSlideTrainer, _suits)

@@ -18,7 +18,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import Any, ClassVar, cast
+from typing import Any, ClassVar, NamedTuple, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -133,8 +133,7 @@ class Edges:
         return laid @ values.unflatten(0, (self.n_atoms, self.n_atoms)).transpose(1, 2)
 
 
-@dataclass(frozen=True, eq=False)
-class EdgeGeometry:
+class EdgeGeometry(NamedTuple):
     """`distance_nm` (n_edges, rows) and `radial` (n_edges, rows, n_radial); `shapes`: the direction from sender to
     receiver and its products (`products`), laid out by `Edges.by_atom`."""
 
@@ -164,17 +163,15 @@ def find_edges(
 ) -> Edges:
     """Return the edges of frames `(rows, n_atoms, 3)` nm of a molecule: those that any of the frames needs."""
     n_atoms = positions_nm.shape[1]
-    if n_atoms <= few:
-        pairs = _all_pairs(n_atoms)
-    else:
+    dense = n_atoms <= few
+    pairs = _all_pairs(n_atoms) if dense else {}
+    if not dense:
         from scipy.spatial import cKDTree
 
-        pairs = {}
         for frame in positions_nm.detach().cpu().double().numpy():
             near: np.ndarray = cKDTree(frame).query_pairs(cutoff_nm, output_type="ndarray")
             pairs |= {(int(i), int(j)): N_SHELLS - 1 for i, j in near}
     pairs |= shells
-    dense = n_atoms <= few
     own = [(i, i, N_SHELLS - 1) for i in range(n_atoms)] if dense else []
     both = sorted([(i, j, s) for (i, j), s in pairs.items()] + [(j, i, s) for (i, j), s in pairs.items()] + own)
     receiver, sender, shell = torch.tensor(both, dtype=torch.int64, device=positions_nm.device).reshape(-1, 3).T
@@ -250,8 +247,7 @@ class Fabric:
         return Fabric(molecule, bonded_shells(molecule), bonds, present, groups, one_hot)
 
 
-@dataclass(frozen=True, eq=False)
-class EdgeWeights:
+class EdgeWeights(NamedTuple):
     """Weights that depend on the molecule alone, made once for chunk after chunk: `of_atom` (n_atoms, width), `looks`
     of each step (n_edges, n_radial, ...), `table` (n_edges, n_radial, n_members), walls (n_edges, 1)."""
 
@@ -340,10 +336,8 @@ class EnergyNetwork(nn.Module):
         nn.init.zeros_(self.table.weight)
         nn.init.zeros_(self.table.bias)
         # The shortest and the longest distance of training, by shell and types: beyond them stands a wall.
-        self.register_buffer("nearest_nm", torch.zeros(N_SHELLS, N_TYPES, N_TYPES))
-        self.register_buffer("farthest_nm", torch.full((N_SHELLS, N_TYPES, N_TYPES), NO_WALL_NM))
-        self.nearest_nm: Tensor
-        self.farthest_nm: Tensor
+        self.nearest_nm = nn.Buffer(torch.zeros(N_SHELLS, N_TYPES, N_TYPES))
+        self.farthest_nm = nn.Buffer(torch.full((N_SHELLS, N_TYPES, N_TYPES), NO_WALL_NM))
 
     def set_walls(self, positions_nm: Tensor, fabric: Fabric) -> None:
         """Stand walls a little beyond the distances of samples `(n, n_atoms, 3)` nm: the shortest of all pairs of like
@@ -375,14 +369,9 @@ class EnergyNetwork(nn.Module):
         types = edges.shell, elements[edges.receiver], elements[edges.sender]
         # An atom is as far from itself as no wall stands.
         farthest = torch.where(edges.receiver == edges.sender, torch.inf, self.farthest_nm[types])
-        return EdgeWeights(
-            edges,
-            z,
-            tuple(look.weights(of_edge) for look in cast(Iterable[Look], self.looks)),
-            self.table(of_edge).unflatten(-1, (self.config.n_radial, -1)),
-            self.nearest_nm[types][:, None],
-            farthest[:, None],
-        )
+        looks = tuple(look.weights(of_edge) for look in cast(Iterable[Look], self.looks))
+        table = self.table(of_edge).unflatten(-1, (self.config.n_radial, -1))
+        return EdgeWeights(edges, z, looks, table, self.nearest_nm[types][:, None], farthest[:, None])
 
     def forward(self, positions_nm: Tensor, fabric: Fabric, made: EdgeWeights) -> Tensor:
         """Frames `(rows, n_atoms, 3)` nm -> energies `(rows, n_members)`."""
@@ -488,24 +477,16 @@ class SimdPotential:
 
         class Network(ctypes.Structure):
             _fields_ = [
-                ("n", ctypes.c_int64),
-                ("steps", _Step * config.n_steps),
-                ("site", _Linear),
+                ("n", ctypes.c_int64), ("steps", _Step * config.n_steps), ("site", _Linear),
                 *((name, ctypes.c_void_p) for name in ("members", "of_atom", "edges", "pairs")),
-                ("eta", ctypes.c_float),
-                ("wall", ctypes.c_float),
-            ]
+                ("eta", ctypes.c_float), ("wall", ctypes.c_float),
+            ]  # fmt: skip
 
+        read_out = torch.cat([members, members.mean(0, keepdim=True)])
+        arrays = (read_out, made.of_atom, seen.transpose(1, 2), torch.stack(pairs, dim=-1))
+        places = (self._array(array) for array in arrays)
         self._network = Network(
-            n,
-            (_Step * config.n_steps)(*steps),
-            self._linear(network.site[0]),
-            self._array(torch.cat([members, members.mean(0, keepdim=True)])),
-            self._array(made.of_atom),
-            self._array(seen.transpose(1, 2)),
-            self._array(torch.stack(pairs, dim=-1)),
-            config.step,
-            WALL,
+            n, (_Step * config.n_steps)(*steps), self._linear(network.site[0]), *places, config.step, WALL
         )
 
     def __deepcopy__(self, memo: dict[int, Any]) -> SimdPotential:
@@ -577,7 +558,7 @@ class SimdPotential:
         return _Linear(self._array(layer.weight), self._array(layer.weight.T), self._array(layer.bias))
 
 
-def simd_potential_of(network: EnergyNetwork, fabric: Fabric, made: EdgeWeights, rows: int, *, unit: float = 1.0,
+def simd_potential_of(network: EnergyNetwork, fabric: Fabric, made: EdgeWeights, rows: int, unit: float = 1.0,
                       zero: float = 0.0) -> SimdPotential | None:  # fmt: skip
     """Return the potential by SIMD, compiled for so many frames; None where it does not run so: not in single precision
     on this processor, for so many atoms that pairs change from frame to frame, or without a C++ compiler."""
@@ -637,15 +618,13 @@ class PainetPotential(Potential):
 
     arch: ClassVar[str] = "painet-potential"
     config: PotentialConfig
-    energy_offset_kj_mol: Tensor
-    energy_scale_kj_mol: Tensor
 
     def __init__(self, config: PotentialConfig) -> None:
         super().__init__()
         self.config = config
         self.network = EnergyNetwork(config)
-        self.register_buffer("energy_offset_kj_mol", torch.zeros(()))
-        self.register_buffer("energy_scale_kj_mol", torch.full((), 100.0))
+        self.energy_offset_kj_mol = nn.Buffer(torch.zeros(()))
+        self.energy_scale_kj_mol = nn.Buffer(torch.full((), 100.0))
         self._known: tuple[Molecule, GradientFn] | None = None
         self._woven: Fabric | None = None
 

@@ -1,7 +1,7 @@
-"""Training of PAINET as a potential: it asks an expensive reference about the states it is least sure of, and learns.
+"""Training of PAINET as a potential, by active learning from an expensive reference.
 
 States come from hot MD and turned torsions (the labeller's `explore`), then from the model's own rollouts. Members of
-the potential learn from different samples; where their forces spread most, the reference is asked next.
+the potential learn from different samples; states where their forces spread most are labelled next.
 """
 
 from __future__ import annotations
@@ -16,22 +16,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from surrogate.data.references import References
-from surrogate.models.architecture import RESOLVED, Architecture, Prepared, Settings, Trainer, TrainingRequest
+from surrogate.data import References
+from surrogate.models import architecture as arch
 from surrogate.models.painet.energy import PainetPotential, PotentialConfig
 from surrogate.models.propagator import Molecule
 from surrogate.models.weights import TrainingDomain, provenance_of, save_weights
+from surrogate.training import loop
 from surrogate.training.devices import StepThreads, torch_threads
-from surrogate.training.loop import (
-    ProgressFn,
-    Stage,
-    StageConfig,
-    append_row,
-    load_tensors,
-    read_curves,
-    save_tensors,
-    train_stages,
-)
 from systems.chemistry.graph import turn_torsions
 from systems.chemistry.validity import WIDENING, geometry_from_frames, limits_from_frames
 from systems.errors import InputError, SimulationError
@@ -79,12 +70,12 @@ class Samples:
     def save(self, path: Path, molecule: str) -> None:
         """Write them whole or not at all; `molecule`: whose they are."""
         tensors = {f.name: torch.from_numpy(np.ascontiguousarray(getattr(self, f.name))) for f in fields(self)}
-        save_tensors(path, "surromd_samples", {"molecule": molecule}, tensors)
+        loop.save_tensors(path, "surromd_samples", {"molecule": molecule}, tensors)
 
     @staticmethod
     def load(path: Path, molecule: str) -> Samples:
         """Read them back. Raises InputError for a damaged file or another molecule's."""
-        record, tensors = load_tensors(path, "surromd_samples")
+        record, tensors = loop.load_tensors(path, "surromd_samples")
         if record.get("molecule") != molecule:
             raise InputError(f"samples {path} are of another molecule; train again without `resume`.")
         return Samples(**{name: tensor.numpy() for name, tensor in tensors.items()})
@@ -96,9 +87,8 @@ class Samples:
 
 
 def domain_of(scene: Scene, samples: Samples, moving: list[Any], config: PotentialConfig) -> TrainingDomain:
-    """Return what the weights cover: the reference's quieter samples say what frames look like; runs of cheap MD,
-    `moving` (n, n_atoms, 3) each, how far they move from one to the next, hot ones since hydroxyls turn at their own
-    rate."""
+    """Return what the weights cover: what frames look like by the reference's quieter samples, and how far they move
+    from one to the next by runs of cheap MD, `moving` (n, n_atoms, 3) each, hot ones among them."""
     conditions = {
         "force_field": "gfn2-xtb", "solvent": "vacuum", "temperature_k": config.temperature_k,
         "friction_per_ps": config.friction_per_ps, "timestep_ps": config.timestep_ps,
@@ -116,7 +106,7 @@ def domain_of(scene: Scene, samples: Samples, moving: list[Any], config: Potenti
     return TrainingDomain(scene, config.lag_ps, conditions, geometry.to_dict(), limits.to_dict(), ())
 
 
-# The share of the budget in which states are asked for; what is missing then is asked for at once, unless a pause or a
+# The share of the budget in which states are labelled; what is missing then is labelled at once, unless a pause or a
 # resumption has brought the training so far that it would hardly learn them.
 _LABELLING_SHARE, _LAST_LABELLING_SHARE = 0.4, 0.7
 # Most of the budget that new states and their answers may take.
@@ -158,10 +148,10 @@ class ReferenceForces(Protocol):
 
 @dataclass(frozen=True)
 class PotentialTraining:
-    """Training settings. `first` states are asked for at once, then more in `rounds` up to `most`, until the mean
+    """Training settings. `first` states are labelled at once, then more in `rounds` up to `most`, until the mean
     absolute error of held-out forces is below `tolerance_kj_mol_nm`; `held_share` of them is never learned. `budget_s`:
-    of wall time for all that it takes, from the first states to the weights. `matrix_rate`: learning rate of matrices,
-    by Muon. `energy_weight`: of energies beside forces in the loss. `temperatures_k`: of hot MD and own rollouts."""
+    wall time of all that it takes, from the first states to the weights. `matrix_rate`: learning rate of matrices, by
+    Muon. `energy_weight`: of energies beside forces in the loss. `temperatures_k`: of hot MD and own rollouts."""
 
     budget_s: float | None = None
     steps: int | None = None
@@ -190,7 +180,8 @@ class PotentialTraining:
 
 
 class Learner:
-    """A potential, its samples and its labeller: `loss` learns and asks, `errors` measures on held-out states."""
+    """A potential, its samples and its reference: `loss` learns, and labels new states when they are due; `errors`
+    measures on held-out states."""
 
     def __init__(
         self, model: PainetPotential, reference: ReferenceForces, config: PotentialTraining, out: Path, *, resume: bool
@@ -206,7 +197,7 @@ class Learner:
         self._threads = StepThreads(1 if config.budget_s is None else torch.get_num_threads())
         self._spent_s, self._steps = 0.0, 0
         curves = out.with_suffix(".csv")
-        if resume and curves.exists() and (rows := [row for rows in read_curves(curves).values() for row in rows]):
+        if resume and curves.exists() and (rows := [row for rows in loop.read_curves(curves).values() for row in rows]):
             self._spent_s, self._steps = float(rows[-1]["spent_s"]), int(rows[-1]["step"])
         if resume and self.path.exists():
             self.samples = Samples.load(self.path, self.key)
@@ -264,7 +255,7 @@ class Learner:
     def errors(self) -> dict[str, float]:
         """Errors on held-out states: of forces in kJ/mol/nm, mean absolute and root mean square, beside the mean
         absolute force, and of energies (less their mean) in kJ/mol, beside the members' spread there; how many states
-        have been asked for."""
+        have been labelled."""
         numbers = np.flatnonzero(self.samples.held)
         some = np.linspace(0, len(numbers) - 1, min(len(numbers), _MEASURED)).astype(int)
         held = self.samples.where(numbers[some])
@@ -305,8 +296,7 @@ class Learner:
         self._label_more(n, generator)
 
     def _label_more(self, n: int, generator: torch.Generator) -> None:
-        """Ask about `n` states of own rollouts and, fewer, of hot MD: any of them, and as many where members spread
-        most."""
+        """Label `n` states of own rollouts and, fewer, of hot MD: half of them where members spread most."""
         began = time.monotonic()
         seed = int(torch.randint(2**31, (), generator=generator))
         own = self._own_states(max(_REPLICAS, n // _OWN_FRAMES), seed)
@@ -351,7 +341,7 @@ class Learner:
         return found[torch.isfinite(found).all(-1).all(-1) & (found.abs().amax((1, 2)) < 10.0)].numpy()
 
     def _label(self, states: Any, *, held: float, measured: bool = False) -> None:
-        """Ask about states and take the answers; `measured`: note the error before they are learned."""
+        """Label states and learn from them; `measured`: note the error before."""
         answers = self.reference.label(states)
         n = len(answers.energies_kj_mol)
         if not n:
@@ -362,7 +352,7 @@ class Learner:
         new = Samples(answers.positions_nm, answers.energies_kj_mol, answers.forces_kj_mol_nm, kept)
         if measured:
             row = {"evaluations": len(self.samples), "share": self.share, **self._measured(self.samples.plausible(new))}
-            append_row(self.rounds_path, row)
+            loop.append_row(self.rounds_path, row)
         self.samples = self.samples.joined(new)
         self.samples.save(self.path, self.key)
         self._use()
@@ -386,13 +376,11 @@ def samples_path(out: Path) -> Path:
 
 def learn_potential(
     reference: ReferenceForces, out: Path, model_config: PotentialConfig, config: PotentialTraining, *,
-    resume: bool = False, progress: ProgressFn | None = None, before_s: float = 0.0, after_s: float = 0.0,
+    resume: bool = False, progress: loop.ProgressFn | None = None, before_s: float = 0.0, after_s: float = 0.0,
 ) -> Path:  # fmt: skip
     """Learn a molecule's energies and forces and write weights `out`; beside them stay the samples, the curves (.csv)
-    and the error of forces against evaluations, round by round (NAME.rounds.csv).
-
-    Of the budget `before_s` are spent already, and `after_s` are wanted by whoever called, for later.
-    """
+    and the error of forces against evaluations, round by round (NAME.rounds.csv). Of the budget `before_s` are spent
+    already, and `after_s` are wanted by the caller, for later."""
     began = time.monotonic() - before_s
     torch.manual_seed(config.seed)
     model = PainetPotential(model_config)
@@ -409,7 +397,7 @@ def learn_potential(
     if budget_s is not None:
         left_s = budget_s - (time.monotonic() - began) - after_s
         budget_s = max(left_s, _LEARNING_SHARE * budget_s)
-    stage = StageConfig("potential", config.batch, config.learning_rate, budget_s, config.steps,
+    stage = loop.StageConfig("potential", config.batch, config.learning_rate, budget_s, config.steps,
                         matrix_rate=config.matrix_rate, seed=config.seed, bf16=False,
                         validate_every_s=config.validate_every_s)  # fmt: skip
 
@@ -427,27 +415,27 @@ def learn_potential(
         save_weights(out, model.eval(), domain, provenance_of(origin, settings))
 
     learner.begin(budget_s)
-    stages = [Stage(model, stage, learner.loss, learner.errors, saves=False)]
+    stages = [loop.Stage(model, stage, learner.loss, learner.errors, saves=False)]
     with torch_threads(1):
-        train_stages(stages, out, write, device=torch.device("cpu"), resume=resume, progress=advance)
+        loop.train_stages(stages, out, write, device=torch.device("cpu"), resume=resume, progress=advance)
     return out
 
 
-class PotentialTrainer(Trainer):
+class PotentialTrainer(arch.Trainer):
     """Refuses trajectories, which say too little about forces; `learn` takes a molecule and its reference."""
 
-    def check(self, request: TrainingRequest) -> None:
+    def check(self, request: arch.TrainingRequest) -> None:
         raise _no_trajectories(request)
 
-    def settings(self, request: TrainingRequest) -> Settings:
+    def settings(self, request: arch.TrainingRequest) -> arch.Settings:
         """See `Trainer.settings`."""
         training = request.settings(PotentialTraining)
-        return Settings(PotentialConfig.from_dict(request.model), training, RESOLVED)
+        return arch.Settings(PotentialConfig.from_dict(request.model), training, arch.RESOLVED)
 
-    def prepare(self, references: References, request: TrainingRequest) -> Prepared:
+    def prepare(self, references: References, request: arch.TrainingRequest) -> arch.Prepared:
         raise _no_trajectories(request)
 
-    def learn(self, reference: ReferenceForces, request: TrainingRequest, advance: Callable[[str, float], None], *,
+    def learn(self, reference: ReferenceForces, request: arch.TrainingRequest, advance: Callable[[str, float], None], *,
               before_s: float = 0.0, after_s: float = 0.0) -> Path:  # fmt: skip
         """Learn a molecule from its reference, as the request has it, and return the weights; see `learn_potential`."""
         settings = self.settings(request)
@@ -457,11 +445,11 @@ class PotentialTrainer(Trainer):
         )  # fmt: skip
 
 
-def _no_trajectories(request: TrainingRequest) -> InputError:
+def _no_trajectories(request: arch.TrainingRequest) -> InputError:
     return InputError(
         f"{request.arch} learns from forces that are computed for it; give a molecule, `arch='painet'` and "
         "`level='gfn2-xtb'`."
     )
 
 
-PAINET_POTENTIAL = Architecture("painet-potential", PotentialConfig.from_dict, PainetPotential, PotentialTrainer)
+PAINET_POTENTIAL = arch.Architecture("painet-potential", PotentialConfig.from_dict, PainetPotential, PotentialTrainer)

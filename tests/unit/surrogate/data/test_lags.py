@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from surrogate.data.frames import TrainingFrames
-from surrogate.data.references import StrideSampler, strides_up_to
+from surrogate.data import StrideSampler, TrainingFrames, strides_up_to
 from surrogate.models.lam_slide.model import LamSlideConfig
 from surrogate.models.lam_slide.trainer import TrainingConfig, train_lam_slide, window_frames
 from surrogate.models.weights import Weights, load_weights, save_weights

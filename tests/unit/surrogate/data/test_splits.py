@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from surrogate import api
-from surrogate.data.frames import RUN, Split, TrainingFrames, collect_frames, load_frames, refuse_leaks, write_windows
+from surrogate.data import RUN, Split, TrainingFrames, collect_frames, load_frames, refuse_leaks, write_windows
 from surrogate.models.lam_slide.model import LamSlideConfig
 from surrogate.models.lam_slide.trainer import TrainingConfig, train_lam_slide
 from systems.errors import InputError

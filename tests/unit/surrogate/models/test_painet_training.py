@@ -11,9 +11,16 @@ import numpy as np
 import pytest
 import torch
 
-from surrogate.data.frames import TrainingFrames, at_rest, collect_frames, load_frames, quantise
-from surrogate.models.painet.model import Painet, PainetConfig
-from surrogate.models.painet.trainer import PainetTraining, StateWindows, for_frames, forecast_errors, train_painet
+from surrogate.data import TrainingFrames, at_rest, collect_frames, load_frames, quantise
+from surrogate.models.painet.model import (
+    Painet,
+    PainetConfig,
+    PainetTraining,
+    StateWindows,
+    for_frames,
+    forecast_errors,
+    train_painet,
+)
 from surrogate.models.propagator import Chunk, Molecule
 from surrogate.models.weights import load_weights
 from surrogate.sampling.runner import RolloutConfig, rollout

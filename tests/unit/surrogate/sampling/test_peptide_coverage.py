@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from surrogate import api
-from surrogate.data.frames import Split, TrainingFrames, canonicalise, quantise
+from surrogate.data import Split, TrainingFrames, canonicalise, quantise
 from surrogate.models.architecture import weights_path
 from surrogate.models.peptides.layout import PeptideConfig, chain_features, standard_peptide
 from surrogate.models.peptides.model import PeptideSlide

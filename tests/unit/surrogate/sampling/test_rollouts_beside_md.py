@@ -16,9 +16,8 @@ from scripted_model import (
     weights_of,
 )
 from surrogate.models.weights import TrainingDomain
-from surrogate.sampling.chunks import ChunkSampler
+from surrogate.sampling.chunks import CAUGHT, MD_BETWEEN, ChunkSampler, Guard
 from surrogate.sampling.coupling import Coupling
-from surrogate.sampling.interventions import CAUGHT, MD_BETWEEN, Guard
 from surrogate.sampling.runner import RolloutConfig
 from systems.chemistry.validity import ENERGY
 from systems.errors import InputError, UnknownNameError

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 
-from surrogate.data.frames import TrainingFrames, collect_frames, is_windows, load_frames, quantise
+from surrogate.data import TrainingFrames, collect_frames, is_windows, load_frames, quantise
 from surrogate.models.lam_slide.model import LamSlide, LamSlideConfig, draw_identifiers
 from surrogate.models.lam_slide.trainer import TrainingConfig, flow_loss, train_lam_slide, window_frames
 from surrogate.models.weights import Weights, load_weights, provenance_of, read_header, save_weights
@@ -189,7 +189,7 @@ def test_references_that_do_not_belong_together_are_refused(tmp_path: Path, alan
 
 
 def test_canonical_frames_are_superposed_on_the_template(tmp_path: Path, alanine_dipeptide: Scene) -> None:
-    from surrogate.data.frames import QUANTUM_NM
+    from surrogate.data import QUANTUM_NM
 
     scene = alanine_dipeptide
     angle = 1.0

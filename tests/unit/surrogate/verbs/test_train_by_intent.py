@@ -12,7 +12,7 @@ from safetensors.numpy import load_file
 
 import surrogate as sm
 from command_line import SMALL_LAM_SLIDE, run
-from surrogate.data.references import References
+from surrogate.data import References
 from surrogate.models.architecture import TrainingRequest, toml_text
 from surrogate.models.lam_slide import trainer as choices
 from surrogate.models.lam_slide.model import LamSlideConfig
