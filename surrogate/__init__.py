@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from surrogate.api import *  # noqa: F403
-    from surrogate.sampling.openmm.simulation import Simulation as Simulation
+    from surrogate.sampling.simulation import Simulation as Simulation
     from systems.trajectory.codec import frame_weights as frame_weights
     from systems.trajectory.codec import to_mdanalysis as to_mdanalysis
     from systems.trajectory.codec import to_mdtraj as to_mdtraj
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 __version__ = "0.1.0"
 
 _ELSEWHERE = {
-    "Simulation": "surrogate.sampling.openmm.simulation",
+    "Simulation": "surrogate.sampling.simulation",
     "frame_weights": "systems.trajectory.codec",
     "to_mdanalysis": "systems.trajectory.codec",
     "to_mdtraj": "systems.trajectory.codec",

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Protocol
 
@@ -64,18 +64,6 @@ def progress_bar(label: str, *, quiet: bool, ps_per_frame: float | None = None) 
     finally:
         if started:
             bar.stop()
-
-
-@contextmanager
-def training_bar(label: str) -> Iterator[Callable[[str, float, dict[str, float]], None]]:
-    """Yield a function that a training calls with its stage, the share of it that is done, and its errors."""
-    with progress_bar(label, quiet=False) as advance:
-
-        def report(stage: str, share: float, metrics: dict[str, float]) -> None:
-            if advance is not None:
-                advance(round(1000 * share), 1000, stage)
-
-        yield report
 
 
 def _note(done: int, total: int, per_s: float, ps_per_frame: float | None) -> str:

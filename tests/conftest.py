@@ -76,7 +76,7 @@ def harmonic_frames(alanine_dipeptide):
     """Synthetic training frames: correlated Gaussian motion about the library geometry, two runs of 400 frames."""
     import numpy as np
 
-    from surrogate.data.frames import TrainingFrames, canonicalise, quantise
+    from surrogate.data import TrainingFrames, canonicalise, quantise
 
     scene = alanine_dipeptide
     rng = np.random.default_rng(0)
@@ -91,7 +91,7 @@ def harmonic_frames(alanine_dipeptide):
 @pytest.fixture(scope="session")
 def small_model_config():
     """A model small enough to train in a second."""
-    from surrogate.models.lam_slide.network import ApproximatorConfig, AutoencoderConfig, LamSlideConfig
+    from surrogate.models.lam_slide.model import ApproximatorConfig, AutoencoderConfig, LamSlideConfig
 
     return LamSlideConfig(
         autoencoder=AutoencoderConfig(latent_dim=12, width=64, head_dim=16, random_identifiers=0.0),

@@ -23,7 +23,7 @@ def refuse_trained_on(
     training; an interval between the frames that are compared (`lag_ps`, or all) that the weights do not step to; and
     motion that reference and replicate have in common (`data.frames.refuse_leaks`).
     """
-    from surrogate.data.frames import collect_frames
+    from surrogate.data import collect_frames
 
     domain, name = weights.domain, weights.path.name
     canonical = getattr(weights.model.config, "canonical", True)

@@ -30,7 +30,7 @@ def _scenes(incomplete: str) -> list[str]:
 
 
 def _weights(incomplete: str) -> list[str]:
-    from surrogate.data.shipped import shipped_weights
+    from surrogate.models.architecture import shipped_weights
 
     return [name for name in shipped_weights() if name.startswith(incomplete)]
 

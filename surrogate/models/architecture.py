@@ -11,20 +11,22 @@ with `MY_MODEL = Architecture("my-model", MyConfig.from_dict, MyModel, my_traine
 from __future__ import annotations
 
 import json
+import os
 import tomllib
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from dataclasses import dataclass, field, fields, replace
+from copy import deepcopy
+from dataclasses import asdict, dataclass, field, fields, replace
 from functools import cache
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
+from typing import TYPE_CHECKING, Any, ClassVar, Self, TypeVar
 
 from systems.errors import InputError, UnknownNameError, first_line, nearest
 from systems.files.schema import built
 
 if TYPE_CHECKING:
-    from surrogate.data.references import References, Survey
+    from surrogate.data import References, Survey
     from surrogate.models.propagator import Propagator
 
 
@@ -39,11 +41,21 @@ def build(cls: type[T], record: dict[str, Any], prefix: str = "") -> T:
         raise InputError(f"settings: {error}.") from error
 
 
-def toml_text(record: dict[str, Any], table: str = "") -> str:
-    """Return a record as the TOML of `systems.options.read_toml`; keys whose value is None are left out.
+class ModelConfig:
+    """Base of a model's settings, a frozen dataclass: as a record, which weights files keep, and back."""
 
-    Values are texts, numbers, booleans, and lists and tables of these; tables in lists are written in one line.
-    """
+    def to_dict(self) -> dict[str, Any]:
+        return asdict(self)  # type: ignore[call-overload]
+
+    @classmethod
+    def from_dict(cls, record: dict[str, Any]) -> Self:
+        """Raises InputError for an unknown key, naming the nearest."""
+        return build(cls, record)
+
+
+def toml_text(record: dict[str, Any], table: str = "") -> str:
+    """Return a record of texts, numbers, booleans, and lists and tables of these as TOML, without values that are None;
+    tables in lists are written in one line."""
     kept = {key: value for key, value in record.items() if value is not None}
     lines = [f"{key} = {_inline(value)}" for key, value in kept.items() if not isinstance(value, dict)]
     text = "".join(f"{line}\n" for line in lines)
@@ -73,28 +85,25 @@ class Suitability:
     reason: str
 
 
-def never(survey: Survey) -> None:
-    """The predicate of an architecture that is trained only when it is asked for by name."""
-
-
 @dataclass(frozen=True)
 class Architecture:
     """One kind of surrogate, under the name that weights files and `arch` have for it.
 
     `config` builds a configuration from a record (InputError for unknown keys), `model` the network from that.
     `trainer` returns its `Trainer`; rollouts do not call it, so that it may import what only training needs.
-    `suits` returns how well the architecture suits references, None where it does not.
+    `suits` returns how well the architecture suits references, None where it does not: it is trained when it is asked
+    for by name.
     """
 
     name: str
     config: Callable[[dict[str, Any]], Any]
     model: Callable[[Any], Propagator]
     trainer: Callable[[], Any]
-    suits: Callable[[Survey], Suitability | None] = never
+    suits: Callable[[Survey], Suitability | None] = lambda survey: None
 
 
-# The interface between the verb `train` and an architecture: choices for the references, settings, the training.
-
+# Settings of trainings that the command line decides.
+RESOLVED = frozenset({"budget_s", "steps", "seed", "device"})
 # (stage, share of all that is to be done) -> None
 AdvanceFn = Callable[[str, float], None]
 
@@ -121,7 +130,7 @@ class TrainingRequest:
 
     def with_choices(self, choices: tuple[Choice, ...]) -> TrainingRequest:
         """Return the request with what was chosen in its tables."""
-        tables = {"model": _copied(self.model), "training": _copied(self.training)}
+        tables = {"model": deepcopy(self.model), "training": deepcopy(self.training)}
         for choice in choices:
             *path, last = choice.key.split(".")
             table: dict[str, Any] = tables
@@ -130,9 +139,11 @@ class TrainingRequest:
             table[last] = choice.value
         return replace(self, model=tables["model"], training=tables["training"])
 
-    def settings(self, kind: type[T], asked: dict[str, Any]) -> T:
-        """Return the training's settings `kind`: the table `training` and what was `asked` for on the command line,
-        which the table may not hold as well. Raises InputError for unknown keys."""
+    def settings(self, kind: type[T], asked: dict[str, Any] | None = None) -> T:
+        """Return the training's settings `kind`: the table `training` and what was `asked` for on the command line
+        (budget, steps, seed and device if None), which the table may not hold as well. Raises InputError for unknown
+        keys."""
+        asked = {name: getattr(self, name) for name in RESOLVED} if asked is None else asked
         if twice := sorted(asked.keys() & self.training):
             raise InputError(f"training.{twice[0]} is set on the command line, not in the configuration file.")
         return build(kind, {**self.training, **asked}, "training.")
@@ -140,15 +151,15 @@ class TrainingRequest:
 
 @dataclass(frozen=True)
 class Choice:
-    """A setting that was chosen for these references: `key` ('model.graph') in the configuration file, its value, and
-    the reason in a few words."""
+    """A setting that was chosen for these references: `key` ('model.longest_ps') in the configuration file, its value,
+    and the reason in a few words."""
 
     key: str
     value: Any
     reason: str
 
     def line(self) -> str:
-        """Return it for people: 'model.graph = true: 28 molecules, atoms known by their bonds'."""
+        """Return it for people: 'model.longest_ps = 900.0: as far as every reference reaches'."""
         shown = str(self.value).lower() if isinstance(self.value, bool) else self.value
         return f"{self.key} = {shown}: {self.reason}"
 
@@ -157,7 +168,7 @@ class Choice:
 class Settings:
     """The configuration of a model and of its training, as they will be used: frozen dataclasses.
 
-    `settled`: names of those of the training that the command line decides (budget, seed, ...), and of those of the
+    `resolved`: names of those of the training that the command line decides (budget, seed, ...), and of those of the
     model that training finds; neither belongs into a configuration file.
     """
 
@@ -200,17 +211,12 @@ class Trainer(ABC):
             _refuse(request.arch, [k for k, v in given.items() if v is not None], "is fitted in one go")
         elif request.budget_s is None and request.steps is None:
             raise InputError("say how long to train: `budget_s='30min'` or `steps=10000`.")
-        unknown = []
-        if request.start_from is not None and not self.goes_on:
-            unknown.append("`start_from`")
-        if request.longest_lag_ps is not None and not self.learns_lags:
-            unknown.append("`longest_lag_ps`")
-        _refuse(request.arch, unknown, "does not know it")
-        if request.start_from is not None:
-            if request.longest_lag_ps is not None:
-                raise InputError("`start_from` takes the configuration of its weights; leave `longest_lag_ps` out.")
-            if request.model:
-                raise InputError("`start_from` takes the configuration of its weights; leave [model] of `config` out.")
+        unknown = {"`start_from`": request.start_from is not None and not self.goes_on,
+                   "`longest_lag_ps`": request.longest_lag_ps is not None and not self.learns_lags}  # fmt: skip
+        _refuse(request.arch, [k for k, is_given in unknown.items() if is_given], "does not know it")
+        if request.start_from is not None and (request.longest_lag_ps is not None or request.model):
+            which = "[model] of `config`" if request.model else "`longest_lag_ps`"
+            raise InputError(f"`start_from` takes the configuration of its weights; leave {which} out.")
 
     def choose(self, references: References, request: TrainingRequest) -> tuple[Choice, ...]:
         """Return the settings that suit the references where they differ from the defaults; those that the request
@@ -231,12 +237,7 @@ def _refuse(arch: str, options: list[str], why: str) -> None:
         raise InputError(f"{', '.join(options)}: {arch} {why}; leave it out.")
 
 
-def _copied(table: dict[str, Any]) -> dict[str, Any]:
-    return {key: _copied(value) if isinstance(value, dict) else value for key, value in table.items()}
-
-
-# The installed architectures: entry points of the group `surromd.architectures`, loaded when they are used.
-
+# Entry points, loaded when they are used.
 GROUP = "surromd.architectures"
 
 
@@ -247,11 +248,8 @@ def names() -> list[str]:
 
 @cache
 def architecture(name: str) -> Architecture:
-    """Return the architecture of this name.
-
-    Raises UnknownNameError, naming the nearest, and InputError where its package cannot be imported or offers
-    something else under that name.
-    """
+    """Return the architecture of this name. Raises UnknownNameError, naming the nearest, and InputError where its
+    package cannot be imported or offers something else under that name."""
     found = _found().get(name)
     if found is None:
         raise UnknownNameError(f"unknown architecture {name!r}; known: {', '.join(names())}.{nearest(name, names())}")
@@ -291,3 +289,28 @@ def _own() -> list[EntryPoint]:
         return []
     declared = record.get("entry-points", {}).get(GROUP, {})
     return [EntryPoint(name, value, GROUP) for name, value in declared.items()]
+
+
+_FOLDER = Path(__file__).parents[1] / "pretrained"
+
+
+def shipped_weights() -> dict[str, Path]:
+    """Return the files of the weights that are shipped, by name."""
+    return {p.stem: p for p in sorted(_FOLDER.glob("*.safetensors"))}
+
+
+def weights_path(weights: str | os.PathLike[str]) -> Path:
+    """Return the file of shipped weights by name, or the path itself. Raises UnknownNameError, naming the nearest, or
+    InputError where there is no such file."""
+    path = Path(weights)
+    if path.suffix == ".safetensors" or path.exists():
+        if not path.is_file():
+            raise InputError(f"{path}: no such weights file.")
+        return path
+    shipped = shipped_weights()
+    if str(weights) not in shipped:
+        raise UnknownNameError(
+            f"no weights are called {str(weights)!r}; shipped: {', '.join(shipped) or 'none'}."
+            f"{nearest(str(weights), list(shipped))} A trained file is named by its path (.safetensors)."
+        )
+    return shipped[str(weights)]

@@ -2,26 +2,26 @@
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 import numpy.typing as npt
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
-from surrogate.data.frames import TrainingFrames, fitted_atoms
-from surrogate.data.references import References
-from surrogate.models.architecture import Architecture, Prepared, Settings, Trainer, TrainingRequest, build
+from surrogate.data import References, TrainingFrames, fitted_atoms
+from surrogate.models.architecture import Architecture, ModelConfig, Prepared, Settings, Trainer, TrainingRequest
 from surrogate.models.propagator import Chunk, Molecule, Propagator
 from surrogate.models.weights import provenance_of, save_weights, training_domain
 from systems.errors import InputError
 
 
 @dataclass(frozen=True)
-class BaselineConfig:
+class BaselineConfig(ModelConfig):
     """Sizes that a baseline's tensors have: `n_new` frames a call, `n_atoms` (0: any), and of those that keep frames,
     modes or states, how many."""
 
@@ -35,20 +35,11 @@ class BaselineConfig:
         if self.n_new < 1:
             raise InputError(f"n_new = {self.n_new} must be at least 1.")
 
-    def to_dict(self) -> dict[str, Any]:
-        return asdict(self)
-
-    @staticmethod
-    def from_dict(record: dict[str, Any]) -> BaselineConfig:
-        """Raises InputError for an unknown key, naming the nearest."""
-        return build(BaselineConfig, record)
-
 
 class Baseline(Propagator):
     """What all of them share; those fitted to one molecule work in its canonical frame."""
 
     config: BaselineConfig
-    conditions_on: ClassVar[int] = 1
     fitted: ClassVar[bool] = False
     # Whether successive frames have nothing in common, so that no limit of jumps is theirs.
     leaps: ClassVar[bool] = False
@@ -58,20 +49,22 @@ class Baseline(Propagator):
         self.config = config
 
     @property
-    def n_conditioning(self) -> int:
-        return self.conditions_on
-
-    @property
     def n_new(self) -> int:
         return self.config.n_new
 
     def noise_shape(self, n_atoms: int) -> tuple[int, ...]:
         return (0,)
 
-    def check_atoms(self, molecule: Molecule) -> None:
-        """Raise InputError for another number of atoms than the baseline was fitted to."""
+    @abstractmethod
+    def frames_after(self, last_frames_nm: Tensor, noise: Tensor) -> Tensor:
+        """Return the next frames `(b, n_new, n_atoms, 3)`; otherwise as `Propagator.next_chunk`."""
+
+    def next_chunk(self, last_frames_nm: Tensor, molecule: Molecule, noise: Tensor, *, solver_steps: int = 1,
+                   solver: str | None = None, last_velocities_nm_ps: Tensor | None = None) -> Chunk:  # fmt: skip
+        """See `Propagator.next_chunk`. Raises InputError for another number of atoms than it was fitted to."""
         if self.config.n_atoms not in (0, molecule.n_atoms):
             raise InputError(f"this {self.arch} model has {self.config.n_atoms} atoms, not {molecule.n_atoms}.")
+        return Chunk(self.frames_after(last_frames_nm, noise))
 
 
 class FrozenFrame(Baseline):
@@ -79,24 +72,20 @@ class FrozenFrame(Baseline):
 
     arch: ClassVar[str] = "frozen"
 
-    def next_chunk(self, last_frames_nm: Tensor, molecule: Molecule, noise: Tensor, *, solver_steps: int = 1,
-                   solver: str | None = None, last_velocities_nm_ps: Tensor | None = None) -> Chunk:  # fmt: skip
-        """See `Propagator.next_chunk`."""
-        return Chunk(last_frames_nm[:, -1:].repeat(1, self.n_new, 1, 1))
+    def frames_after(self, last_frames_nm: Tensor, noise: Tensor) -> Tensor:
+        return last_frames_nm[:, -1:].repeat(1, self.n_new, 1, 1)
 
 
 class ConstantVelocity(Baseline):
     """The step from the frame before the last to the last, repeated."""
 
     arch: ClassVar[str] = "constant-velocity"
-    conditions_on: ClassVar[int] = 2
+    n_conditioning = 2
 
-    def next_chunk(self, last_frames_nm: Tensor, molecule: Molecule, noise: Tensor, *, solver_steps: int = 1,
-                   solver: str | None = None, last_velocities_nm_ps: Tensor | None = None) -> Chunk:  # fmt: skip
-        """See `Propagator.next_chunk`."""
+    def frames_after(self, last_frames_nm: Tensor, noise: Tensor) -> Tensor:
         last = last_frames_nm[:, -1:]
         steps = torch.arange(1, self.n_new + 1, device=last.device)[None, :, None, None]
-        return Chunk(last + steps * (last - last_frames_nm[:, -2:-1]))
+        return last + steps * (last - last_frames_nm[:, -2:-1])
 
 
 class TrainingFrameResampling(Baseline):
@@ -105,20 +94,16 @@ class TrainingFrameResampling(Baseline):
     arch: ClassVar[str] = "resampling"
     fitted: ClassVar[bool] = True
     leaps: ClassVar[bool] = True
-    frames_nm: Tensor
 
     def __init__(self, config: BaselineConfig) -> None:
         super().__init__(config)
-        self.register_buffer("frames_nm", torch.zeros(config.n_frames, config.n_atoms, 3))
+        self.frames_nm = nn.Buffer(torch.zeros(config.n_frames, config.n_atoms, 3))
 
     def noise_shape(self, n_atoms: int) -> tuple[int, ...]:
         return (self.n_new,)
 
-    def next_chunk(self, last_frames_nm: Tensor, molecule: Molecule, noise: Tensor, *, solver_steps: int = 1,
-                   solver: str | None = None, last_velocities_nm_ps: Tensor | None = None) -> Chunk:  # fmt: skip
-        """See `Propagator.next_chunk`."""
-        self.check_atoms(molecule)
-        return Chunk(self.frames_nm[pick(noise, torch.full_like(noise, self.config.n_frames).long())])
+    def frames_after(self, last_frames_nm: Tensor, noise: Tensor) -> Tensor:
+        return self.frames_nm[pick(noise, torch.full_like(noise, self.config.n_frames).long())]
 
 
 class NormalModes(Baseline):
@@ -131,25 +116,19 @@ class NormalModes(Baseline):
 
     arch: ClassVar[str] = "normal-modes"
     fitted: ClassVar[bool] = True
-    conditions_on: ClassVar[int] = 2
-    mean_nm: Tensor
-    modes: Tensor
-    coefficients: Tensor
+    n_conditioning = 2
 
     def __init__(self, config: BaselineConfig) -> None:
         super().__init__(config)
-        self.register_buffer("mean_nm", torch.zeros(config.n_atoms, 3))
+        self.mean_nm = nn.Buffer(torch.zeros(config.n_atoms, 3))
         # Orthonormal rows (n_modes, 3 n_atoms), and a, b, s of each.
-        self.register_buffer("modes", torch.zeros(config.n_modes, 3 * config.n_atoms))
-        self.register_buffer("coefficients", torch.zeros(3, config.n_modes))
+        self.modes = nn.Buffer(torch.zeros(config.n_modes, 3 * config.n_atoms))
+        self.coefficients = nn.Buffer(torch.zeros(3, config.n_modes))
 
     def noise_shape(self, n_atoms: int) -> tuple[int, ...]:
         return (self.n_new, self.config.n_modes)
 
-    def next_chunk(self, last_frames_nm: Tensor, molecule: Molecule, noise: Tensor, *, solver_steps: int = 1,
-                   solver: str | None = None, last_velocities_nm_ps: Tensor | None = None) -> Chunk:  # fmt: skip
-        """See `Propagator.next_chunk`."""
-        self.check_atoms(molecule)
+    def frames_after(self, last_frames_nm: Tensor, noise: Tensor) -> Tensor:
         with torch.autocast(noise.device.type, enabled=False):
             before, last = ((last_frames_nm - self.mean_nm).flatten(2) @ self.modes.T).unbind(1)
             a, b, s = self.coefficients
@@ -158,7 +137,7 @@ class NormalModes(Baseline):
                 before, last = last, a * last + b * before + s * noise[:, t]
                 found.append(last)
             moved = torch.stack(found, dim=1) @ self.modes
-        return Chunk(self.mean_nm + moved.unflatten(-1, (-1, 3)))
+        return self.mean_nm + moved.unflatten(-1, (-1, 3))
 
 
 class MarkovStateModel(Baseline):
@@ -171,20 +150,15 @@ class MarkovStateModel(Baseline):
     arch: ClassVar[str] = "msm"
     fitted: ClassVar[bool] = True
     leaps: ClassVar[bool] = True
-    centres_nm: Tensor
-    cumulative: Tensor
-    frames_nm: Tensor
-    first: Tensor
-    heavy: Tensor
 
     def __init__(self, config: BaselineConfig) -> None:
         super().__init__(config)
-        self.register_buffer("centres_nm", torch.zeros(config.n_states, config.n_atoms, 3))
-        self.register_buffer("cumulative", torch.zeros(config.n_states, config.n_states))
-        self.register_buffer("frames_nm", torch.zeros(config.n_frames, config.n_atoms, 3))
-        self.register_buffer("first", torch.zeros(config.n_states + 1, dtype=torch.int64))
+        self.centres_nm = nn.Buffer(torch.zeros(config.n_states, config.n_atoms, 3))
+        self.cumulative = nn.Buffer(torch.zeros(config.n_states, config.n_states))
+        self.frames_nm = nn.Buffer(torch.zeros(config.n_frames, config.n_atoms, 3))
+        self.first = nn.Buffer(torch.zeros(config.n_states + 1, dtype=torch.int64))
         # One of the atoms that tell states apart, zero of the others.
-        self.register_buffer("heavy", torch.ones(config.n_atoms))
+        self.heavy = nn.Buffer(torch.ones(config.n_atoms))
 
     def noise_shape(self, n_atoms: int) -> tuple[int, ...]:
         return (self.n_new, 2)
@@ -194,10 +168,7 @@ class MarkovStateModel(Baseline):
         flat = (frames_nm * self.heavy[:, None]).flatten(1)
         return torch.cdist(flat, (self.centres_nm * self.heavy[:, None]).flatten(1)).argmin(1)
 
-    def next_chunk(self, last_frames_nm: Tensor, molecule: Molecule, noise: Tensor, *, solver_steps: int = 1,
-                   solver: str | None = None, last_velocities_nm_ps: Tensor | None = None) -> Chunk:  # fmt: skip
-        """See `Propagator.next_chunk`."""
-        self.check_atoms(molecule)
+    def frames_after(self, last_frames_nm: Tensor, noise: Tensor) -> Tensor:
         state = self.states_of(last_frames_nm[:, -1])
         visited = []
         for t in range(self.n_new):
@@ -206,7 +177,7 @@ class MarkovStateModel(Baseline):
             visited.append(state)
         states = torch.stack(visited, dim=1)
         members = self.first[states + 1] - self.first[states]
-        return Chunk(self.frames_nm[self.first[states] + pick(noise[..., 1], members)])
+        return self.frames_nm[self.first[states] + pick(noise[..., 1], members)]
 
 
 def uniform(noise: Tensor) -> Tensor:
@@ -220,8 +191,6 @@ def pick(noise: Tensor, n: Tensor) -> Tensor:
     return torch.minimum((share * n).long(), n - 1)
 
 
-# Fit baselines to reference frames and write them as weights, so that they roll out and are evaluated like any model.
-
 N_KEPT_FRAMES = 4000
 N_STATES = 100
 # Modes that move less than this have no motion to model (a tenth of the frames' int16 unit).
@@ -230,10 +199,8 @@ FloatArray = npt.NDArray[np.float64]
 
 
 def fit_baseline(arch: str, frames: TrainingFrames, out: str | Path, *, n_new: int = 16, seed: int = 0) -> Path:
-    """Fit the baseline called `arch` on the training part of `frames` and write `out` (.safetensors).
-
-    Raises InputError when the frames are not in the canonical pose that the baseline needs, or too few.
-    """
+    """Fit the baseline called `arch` on the training part of `frames` and write `out` (.safetensors). Raises InputError
+    when the frames are not in the canonical pose that the baseline needs, or too few."""
     (kind,) = (b for b in FITS if b.arch == arch)
     if kind.fitted and not frames.canonical:
         raise InputError(f"{arch} is fitted to canonical frames; make the windows without `canonical=False`.")
@@ -244,14 +211,6 @@ def fit_baseline(arch: str, frames: TrainingFrames, out: str | Path, *, n_new: i
         domain = replace(domain, limits={**domain.limits, "jump_idx": []})
     save_weights(out, model, domain, provenance_of(frames.origin, {"seed": seed}))
     return out
-
-
-def fit_frozen(frames: TrainingFrames, n_new: int, rng: np.random.Generator) -> Baseline:
-    return FrozenFrame(BaselineConfig(n_new=n_new))
-
-
-def fit_constant_velocity(frames: TrainingFrames, n_new: int, rng: np.random.Generator) -> Baseline:
-    return ConstantVelocity(BaselineConfig(n_new=n_new))
 
 
 def fit_resampling(frames: TrainingFrames, n_new: int, rng: np.random.Generator) -> Baseline:
@@ -267,11 +226,7 @@ def fit_normal_modes(frames: TrainingFrames, n_new: int, rng: np.random.Generato
     """Principal components of the training frames; each mode's correlations after one and two frames."""
     starts = frames.window_starts(3, validation=False)
     starts = np.sort(rng.permutation(starts)[:50_000])
-    triples = frames.positions_nm(starts[:, None] + np.arange(3)).astype(np.float64)
-    try:
-        return normal_modes_of(triples, n_new)
-    except InputError as error:
-        raise InputError(f"{frames.scene.name}: {error}") from error
+    return normal_modes_of(frames.positions_nm(starts[:, None] + np.arange(3)).astype(np.float64), n_new)
 
 
 def normal_modes_of(triples: FloatArray, n_new: int) -> NormalModes:
@@ -331,10 +286,10 @@ def fit_markov_state_model(frames: TrainingFrames, n_new: int, rng: np.random.Ge
     counts = TransitionCountEstimator(lagtime=1, count_mode="sliding").fit(pieces).fetch_model().submodel_largest()
     msm = MaximumLikelihoodMSM(reversible=True).fit(counts).fetch_model()
     symbols = counts.state_symbols
-    picked = [_members(states, int(k), rng) for k in symbols]
-    model = MarkovStateModel(
-        BaselineConfig(n_new, scene.n_atoms, n_frames=sum(map(len, picked)), n_states=len(symbols))
-    )
+    most = max(1, N_KEPT_FRAMES // N_STATES)
+    picked = [np.sort(rng.permutation(np.flatnonzero(states == k))[:most]) for k in symbols]
+    n_kept = sum(map(len, picked))
+    model = MarkovStateModel(BaselineConfig(n_new, scene.n_atoms, n_frames=n_kept, n_states=len(symbols)))
     centres = np.zeros((len(symbols), scene.n_atoms, 3))
     centres[:, heavy] = clusters.cluster_centers[symbols].reshape(len(symbols), -1, 3)
     model.centres_nm.copy_(torch.from_numpy(centres))
@@ -346,14 +301,9 @@ def fit_markov_state_model(frames: TrainingFrames, n_new: int, rng: np.random.Ge
     return model
 
 
-def _members(states: npt.NDArray[Any], state: int, rng: np.random.Generator) -> npt.NDArray[np.int64]:
-    found = np.flatnonzero(states == state)
-    return np.sort(rng.permutation(found)[: max(1, N_KEPT_FRAMES // N_STATES)])
-
-
 FITS: dict[type[Baseline], Callable[[TrainingFrames, int, np.random.Generator], Baseline]] = {
-    FrozenFrame: fit_frozen,
-    ConstantVelocity: fit_constant_velocity,
+    FrozenFrame: lambda frames, n_new, rng: FrozenFrame(BaselineConfig(n_new)),
+    ConstantVelocity: lambda frames, n_new, rng: ConstantVelocity(BaselineConfig(n_new)),
     TrainingFrameResampling: fit_resampling,
     NormalModes: fit_normal_modes,
     MarkovStateModel: fit_markov_state_model,
@@ -366,11 +316,9 @@ class BaselineTrainer(Trainer):
     fitted = True
 
     def settings(self, request: TrainingRequest) -> Settings:
-        """See `Trainer.settings`."""
         return Settings(None, None)
 
     def prepare(self, references: References, request: TrainingRequest) -> Prepared:
-        """See `Trainer.prepare`."""
         frames = references.frames(canonical=True)
         return Prepared(
             frames.scene.name, lambda advance: fit_baseline(request.arch, frames, request.out, seed=request.seed)

@@ -77,17 +77,16 @@ class PropagatorContract:
         with torch.no_grad():
             return model.next_chunk(frames, molecule, noise, solver_steps=4, last_velocities_nm_ps=velocities)
 
-    def given(self, batch: int = 3) -> tuple[Propagator, Tensor, Molecule, Tensor, Tensor]:
-        model = self.make(self.n_atoms)
-        frames, velocities = self.state(self.n_atoms, batch, model)
-        noise = draw_noise(model, self.n_atoms, [torch.Generator().manual_seed(s) for s in range(batch)])
-        return model, frames, self.molecule(self.n_atoms), noise, velocities
+    def given(self, batch: int = 3, n_atoms: int = 0) -> tuple[Propagator, Tensor, Molecule, Tensor, Tensor]:
+        n_atoms = n_atoms or self.n_atoms
+        model = self.make(n_atoms)
+        frames, velocities = self.state(n_atoms, batch, model)
+        noise = draw_noise(model, n_atoms, [torch.Generator().manual_seed(s) for s in range(batch)])
+        return model, frames, self.molecule(n_atoms), noise, velocities
 
     def test_chunks_have_their_shape_for_every_size(self) -> None:
         for n_atoms in self.sizes:
-            model, molecule = self.make(n_atoms), self.molecule(n_atoms)
-            frames, velocities = self.state(n_atoms, 2, model)
-            noise = draw_noise(model, n_atoms, [torch.Generator().manual_seed(s) for s in range(2)])
+            model, frames, molecule, noise, velocities = self.given(2, n_atoms)
             chunk = self.call(model, frames, molecule, noise, velocities)
             assert chunk.frames_nm.shape == (2, model.n_new, n_atoms, 3), f"{n_atoms} atoms: {chunk.frames_nm.shape}"
             assert chunk.frames_nm.dtype == torch.float32, f"frames are {chunk.frames_nm.dtype}"

@@ -6,12 +6,13 @@ import copy
 import math
 from abc import abstractmethod
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, fields, replace
-from typing import Any, Self
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple, Self
 
 import torch
 from torch import Tensor
 
+from surrogate.models.architecture import ModelConfig
 from surrogate.models.propagator import Chunk, Molecule, Propagator
 from systems.errors import InputError
 from systems.scene import Scene
@@ -31,7 +32,7 @@ ROUNDS = 50
 
 
 @dataclass(frozen=True)
-class IntegratorConfig:
+class IntegratorConfig(ModelConfig):
     """Settings of the MD on a potential, which a potential's own configuration extends.
 
     A chunk is `n_new` frames `lag_ps` apart, in steps of `timestep_ps`, in a Langevin bath at `temperature_k`
@@ -58,12 +59,8 @@ class IntegratorConfig:
         """Whether bonds to hydrogen are rigid, as reference MD's are: at steps above 2 fs."""
         return self.timestep_ps > LONGEST_FLEXIBLE_PS
 
-    def to_dict(self) -> dict[str, Any]:
-        return asdict(self)
 
-
-@dataclass(frozen=True, eq=False)
-class Evaluation:
+class Evaluation(NamedTuple):
     """`energy_kj_mol` (rows,) and `forces_kj_mol_nm` (rows, n_atoms, 3), the mean of the members; `members_kj_mol`
     (rows, n_members)."""
 
@@ -72,8 +69,7 @@ class Evaluation:
     members_kj_mol: Tensor
 
 
-@dataclass(frozen=True, eq=False)
-class Bath:
+class Bath(NamedTuple):
     """Langevin middle steps of `timestep_ps`, velocities `kept` in each and `lost` (rows, n_atoms, 1) times what is
     drawn; `masses` (n_atoms, 1) in Da; `rigid` bonds, if any."""
 
@@ -95,7 +91,7 @@ class Potential(Propagator):
 
     What holds for every potential, beside what holds for every propagator (`surrogate.models.conformance`): the energy
     does not depend on where the molecule lies and how it is turned, is finite and smooth wherever MD may lead it, and
-    is the same whatever other frames are evaluated beside it.
+    does not depend on the frames evaluated beside it.
     """
 
     config: Any
@@ -125,10 +121,6 @@ class Potential(Propagator):
     def forces(self, positions_nm: Tensor, molecule: Molecule) -> Tensor:
         """Frames `(rows, n_atoms, 3)` nm -> forces, with what depends on the molecule alone kept from call to call."""
         return -self.gradient(positions_nm, molecule)(positions_nm)[1]
-
-    @property
-    def n_conditioning(self) -> int:
-        return 1
 
     @property
     def n_new(self) -> int:
@@ -202,9 +194,8 @@ class Potential(Propagator):
             for draw in draws[:, :, 1:].split(self.steps_per_frame, dim=2):
                 x, v = move(x, v, molecule, masses, thermal, draw)
                 frames.append(x)
-            dtype = last_frames_nm.dtype
-            found = torch.stack(frames, dim=1).to(dtype)
-            return Chunk(found, v.to(dtype), float(draws.shape[2] - 1))
+            found = torch.stack(frames, dim=1).to(last_frames_nm.dtype)
+            return Chunk(found, v.to(found.dtype), float(draws.shape[2] - 1))
 
     def bath(self, molecule: Molecule, masses: Tensor, thermal: Tensor, timestep_ps: float | None = None) -> Bath:
         """Return the bath of the settings; `thermal`: see `langevin`."""
@@ -287,8 +278,7 @@ def gradient_of(energy: EnergyFn) -> GradientFn:
 # of all bonds into corrections of all; a few rounds meet the tolerance.
 
 
-@dataclass(frozen=True, eq=False)
-class RigidBonds:
+class RigidBonds(NamedTuple):
     """Bonds between the atoms `first` and `second` (k,), of squared lengths `length2` (k,) nm^2; `per_mass` (k, 2) of
     both ends, 1/Da; `inverse` (k, k) of what corrections do to deviations."""
 
@@ -307,12 +297,11 @@ class RigidBonds:
         row = torch.arange(len(bonds))
         ends[row, first], ends[row, second] = 1.0, -1.0
         shared = (ends / masses_da) @ ends.T
-        return RigidBonds(
-            first, second, along.square().sum(-1), 1.0 / masses_da[bonds], torch.linalg.inv(shared * (along @ along.T))
-        )
+        inverse = torch.linalg.inv(shared * (along @ along.T))
+        return RigidBonds(first, second, along.square().sum(-1), 1.0 / masses_da[bonds], inverse)
 
     def to(self, device: torch.device) -> RigidBonds:
-        return RigidBonds(*(getattr(self, field.name).to(device) for field in fields(self)))
+        return RigidBonds(*(tensor.to(device) for tensor in self))
 
     def place(self, free_nm: Tensor, before_nm: Tensor) -> Tensor:
         """Return positions `(rows, n_atoms, 3)` nearest to `free_nm` at which bonds have their lengths, moved along

@@ -70,10 +70,11 @@ class Chunk:
 class Propagator(nn.Module, ABC):
     """A learned simulator, batched over replicas of one molecule: frames in, frames out, at any lag that it knows.
 
-    A subclass sets `arch` and `config` (a frozen dataclass with `to_dict`, which the weights file keeps) and implements
-    `n_conditioning`, `n_new`, `noise_shape` and `next_chunk`; it overrides `featurise` where it looks at more than
-    elements, masses and bonds, `at_lag` where it was trained for several lags, `solvers` and `usual_steps` where it
-    integrates a flow, and `float32_layers` where it may be evaluated in bf16. `Architecture` says how it is trained.
+    A subclass sets `arch` and `config` (an `architecture.ModelConfig`, which the weights file keeps) and implements
+    `n_new`, `noise_shape` and `next_chunk`; it sets `n_conditioning` where a chunk follows from more than one frame,
+    `solvers` and `usual_steps` where it integrates a flow, `float32_layers` where it may be evaluated in bf16, and
+    overrides `featurise` where it looks at more than elements, masses and bonds, `at_lag` where it was trained for
+    several lags. `Architecture` says how it is trained.
 
     What holds for every model, and what `surrogate.models.conformance` tests:
 
@@ -87,16 +88,13 @@ class Propagator(nn.Module, ABC):
     # Name in weights files and on the command line.
     arch: ClassVar[str]
     config: Any
+    # Frames that a chunk is conditioned on.
+    n_conditioning: int = 1
     # Solvers that `next_chunk` knows, the default first, and its usual steps; none of a model of one evaluation.
     solvers: tuple[str, ...] = ()
     usual_steps: int = 10
     # Prefixes of the names of layers that stay in float32 when the others are evaluated in bf16; None where all do.
     float32_layers: tuple[str, ...] | None = None
-
-    @property
-    @abstractmethod
-    def n_conditioning(self) -> int:
-        """Frames that a chunk is conditioned on."""
 
     @property
     @abstractmethod

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import json
 import platform
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -13,15 +12,14 @@ from typing import Any
 
 import torch
 
-from surrogate.data.frames import TrainingFrames
+from surrogate.data import TrainingFrames
 from surrogate.models.architecture import architecture
 from surrogate.models.propagator import Propagator
-from surrogate.training.loop import tensor_checksum
+from surrogate.training.loop import save_tensors, tensor_checksum
 from systems.chemistry.validity import geometry_from_frames, limits_from_frames
 from systems.errors import InputError, SurromdError, UnknownNameError, WeightsError, first_line
 from systems.files.outside import UNREADABLE
 from systems.files.schema import built, parsed
-from systems.files.whole_file import create_whole
 from systems.scene import Scene
 
 FORMAT = "surromd-weights-1"
@@ -34,7 +32,7 @@ class TrainingDomain:
     """The training domain of weights. `scene` is the template: atom k of the model is its atom k, and canonical
     frames are superposed on its positions. `conditions` are those of the reference (force field, temperature_k, ...);
     `geometry` is what its frames say of valid ones (systems.chemistry.validity.Geometry as a dictionary), `limits` how
-    far they go beyond that (systems.chemistry.validity.Limits; None in files of older versions).
+    far they go beyond that (systems.chemistry.validity.Limits; None where there are none).
 
     `lag_ps`: between frames, the shortest where the model takes a lag; `jumps` are then rows (lag, least and greatest
     jump) that stand for those of `limits` at each lag. `further`: the domains of other molecules trained on.
@@ -104,23 +102,18 @@ class Header:
 def _check_sizes(config: Any, n_tensors: int, n_values: int) -> None:
     """Raise ValueError for more layers than a file has tensors, or a size beyond that of all of them, before any is
     made."""
-    entries = config.items() if isinstance(config, dict) else enumerate(config)
-    for key, value in entries:
+    for key, value in config.items() if isinstance(config, dict) else enumerate(config):
+        most = n_tensors if str(key).endswith(("layers", "rounds")) else n_values
         if isinstance(value, dict | list):
             _check_sizes(value, n_tensors, n_values)
-        elif isinstance(value, int | float) and not abs(value) <= (
-            n_tensors if str(key).endswith(("layers", "rounds")) else n_values
-        ):
+        elif isinstance(value, int | float) and not abs(value) <= most:
             raise ValueError(f"{key} = {value!r} in a file of {n_tensors} tensors with {n_values} numbers")
 
 
 def save_weights(
-    path: str | Path, model: Propagator, domain: TrainingDomain, provenance: dict[str, Any], *,
-    half: bool = False,
-) -> None:  # fmt: skip
+    path: str | Path, model: Propagator, domain: TrainingDomain, provenance: dict[str, Any], *, half: bool = False
+) -> None:
     """Write weights whole or not at all; `half` rounds them to float16, half the size, for shipping."""
-    from safetensors.torch import save_file
-
     header = {
         "arch": model.arch,
         "config": model.config.to_dict(),
@@ -128,41 +121,33 @@ def save_weights(
         "provenance": provenance,
     }
     dtype = torch.float16 if half else torch.float32
-    tensors = {k: v.detach().to("cpu", dtype).contiguous() for k, v in model.state_dict().items()}
-    text = json.dumps(header)
-    metadata = {"format": FORMAT, "surromd": text, "sha256": tensor_checksum(text, tensors)}
-    create_whole(Path(path), lambda temporary: save_file(tensors, temporary, metadata=metadata))
+    tensors = {k: v.to(dtype) for k, v in model.state_dict().items()}
+    save_tensors(Path(path), "surromd", header, tensors, format=FORMAT)
 
 
 def read_header(path: str | Path) -> Header:
     """Return a weights file's record without loading it. Raises InputError (no such file) or WeightsError."""
-    path = Path(path)
-    return _header(path, _metadata(path))
+    return _header(Path(path))[0]
 
 
-def _header(path: Path, metadata: dict[str, str]) -> Header:
-    try:
-        return built(Header, parsed(metadata.get("surromd", "")))
-    except ValueError as error:
-        raise WeightsError(f"{path} is damaged or of a later version: its record is none ({error}).") from error
-
-
-def _metadata(path: Path) -> dict[str, str]:
+def _header(path: Path) -> tuple[Header, dict[str, str]]:
     from safetensors import SafetensorError, safe_open
 
     if not path.is_file():
         raise InputError(f"weights file {path} does not exist.")
     try:
         with safe_open(path, framework="pt") as handle:
-            metadata = handle.metadata() or {}
-            if metadata.get("format") != FORMAT:
-                raise WeightsError(f"{path} is not a surromd weights file (format {metadata.get('format')!r}).")
-            unknown = set(metadata) - {"format", "surromd", "sha256"}
-            if unknown:
-                raise WeightsError(f"{path} is damaged or of a later version: it holds {min(unknown)!r}.")
-            return dict(metadata)
+            metadata = dict(handle.metadata() or {})
     except (SafetensorError, OSError, ValueError) as error:
         raise WeightsError(f"{path} is damaged or not a weights file: {error}") from error
+    if metadata.get("format") != FORMAT:
+        raise WeightsError(f"{path} is not a surromd weights file (format {metadata.get('format')!r}).")
+    if metadata.keys() != {"format", "surromd", "sha256"}:
+        raise WeightsError(f"{path} is damaged or of a later version: it holds {', '.join(sorted(metadata))}.")
+    try:
+        return built(Header, parsed(metadata["surromd"])), metadata
+    except ValueError as error:
+        raise WeightsError(f"{path} is damaged or of a later version: its record is none ({error}).") from error
 
 
 def load_weights(path: str | Path) -> Weights:
@@ -171,15 +156,13 @@ def load_weights(path: str | Path) -> Weights:
     from safetensors.torch import load
 
     path = Path(path)
-    metadata = _metadata(path)
-    header = _header(path, metadata)
+    header, metadata = _header(path)
     data = path.read_bytes()
     try:
         state = load(data)
     except (SafetensorError, ValueError) as error:
         raise WeightsError(f"{path} is damaged or not a weights file: {error}") from error
-    # Files of earlier versions state no checksum.
-    if "sha256" in metadata and metadata["sha256"] != tensor_checksum(metadata["surromd"], state):
+    if metadata["sha256"] != tensor_checksum(metadata["surromd"], state):
         raise WeightsError(f"{path} is damaged: it is not what was written (checksum); restore it from a whole copy.")
     try:
         arch = architecture(header.arch)
@@ -196,19 +179,9 @@ def load_weights(path: str | Path) -> Weights:
         raise WeightsError(f"{path} does not fit its own configuration: {first_line(error)}") from error
     broken = [name for name, tensor in state.items() if not torch.isfinite(tensor).all()]
     if broken:
-        raise WeightsError(
-            f"{path} holds values that are not finite (first in {broken[0]}); train again or re-download."
-        )
-    return Weights(
-        model=model.eval().requires_grad_(False),
-        domain=header.domain,
-        provenance=header.provenance,
-        hash=hashlib.sha256(data).hexdigest()[:16],
-        path=path,
-    )
-
-
-# Training domain and provenance of weights: what they cover, when, where and from what they were made.
+        raise WeightsError(f"{path} holds values that are not finite (first in {broken[0]}); train again.")
+    file_hash = hashlib.sha256(data).hexdigest()[:16]
+    return Weights(model.eval().requires_grad_(False), header.domain, header.provenance, file_hash, path)
 
 
 def training_domain(
@@ -231,8 +204,8 @@ def training_domain(
 
 def provenance_of(origin: dict[str, Any], settings: dict[str, Any], start: Weights | None = None) -> dict[str, Any]:
     """Return when, where and from what weights were made. `origin`: of the frames trained on (`TrainingFrames.origin`);
-    `settings`: of the training; `start`: the weights that it began with, of whose trajectories those are told that are
-    not among `origin`'s."""
+    `settings`: of the training; `start`: the weights that it began with, of whose trajectories those stand there that
+    are not among `origin`'s."""
     earlier = {}
     if start is not None:
         known = {source["sha256"] for source in origin.get("sources", ()) if "sha256" in source}
@@ -248,8 +221,7 @@ def provenance_of(origin: dict[str, Any], settings: dict[str, Any], start: Weigh
 
 
 def _beside(record: dict[str, Any], known: set[str]) -> dict[str, Any]:
-    """Return what earlier weights say of themselves, and those that they began with, of trajectories those that are not
-    `known`."""
+    """Return the record of earlier weights and of those that they began with, without trajectories in `known`."""
     left = [source for source in record.get("sources", ()) if source.get("sha256") not in known]
     found = {**record, "sources": left} if "sources" in record else dict(record)
     if isinstance(record.get("from"), dict):

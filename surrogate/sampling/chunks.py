@@ -1,27 +1,42 @@
-"""Draw chunks from a model: canonical pose, noise from seeds, and batches that halve when memory runs out."""
+"""Chunks that can be trusted: drawn from a model, checked, and helped where a guard catches a frame.
+
+flag: caught frames are marked. resample: from the first caught frame on, the chunk is drawn again with another seed,
+from the last valid frame; after four draws, from where the chunk began. repair: OpenMM restores bond lengths and
+relaxes caught frames under restraints; what is not valid then is drawn again. fallback: real MD runs from the last
+valid frame to the end of the chunk, and the surrogate takes over again.
+
+A model that has got no chunk through yet, gives one without a frame that passes, and another in a second draw, is not
+unlucky but wrong: the rollout stops. Under 'flag', which draws once, it stops at a chunk whose every frame is broken
+(validity.INVALID) or stands still, and where, after some chunks or at its end, it has not got one through.
+"""
 
 from __future__ import annotations
 
 import copy
 import hashlib
-from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, TypeVar
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, field
+from time import perf_counter
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar, cast
 
 import numpy as np
 import numpy.typing as npt
 import torch
 
-from surrogate.data.frames import fitted_atoms
-from surrogate.models.lean import with_compiled_parts, with_lean_parts
+from surrogate.data import fitted_atoms
+from surrogate.models.layers import with_compiled_parts, with_lean_parts
 from surrogate.models.potential import Potential
 from surrogate.models.propagator import Propagator, draw_noise
+from surrogate.sampling.coupling import Coupling, EnergyCheck, MemberSpread
 from surrogate.training.devices import choose_precision, keep_freed_memory, torch_threads
+from systems.chemistry import validity
 from systems.chemistry.geometry import superposition
 from systems.errors import InputError, SimulationError
 
 if TYPE_CHECKING:
-    from surrogate.models.weights import Weights
+    from surrogate.models.weights import TrainingDomain, Weights
 
 FloatArray = npt.NDArray[np.floating[Any]]
 _Model = TypeVar("_Model", bound=Propagator)
@@ -30,8 +45,7 @@ _Model = TypeVar("_Model", bound=Propagator)
 _ROWS_OF_ONE_THREAD = 16
 
 
-@dataclass(frozen=True, eq=False)
-class Drawn:
+class Drawn(NamedTuple):
     """New frames `(b, n_new, n_atoms, 3)` nm and, of a model that carries them, the velocities `(b, n_atoms, 3)` nm/ps
     at the last of them; both in the pose of the frames that they follow."""
 
@@ -146,13 +160,10 @@ class ChunkSampler:
             model = self._compiled if len(seeds) == self._compiled_rows else model
         with torch.autocast("cpu", dtype=torch.bfloat16, enabled=self.precision.bf16):
             chunk = model.next_chunk(
-                torch.from_numpy(canonical.astype(np.float32)),
-                self._molecule,
-                noise,
-                solver_steps=self.solver_steps,
+                torch.from_numpy(canonical.astype(np.float32)), self._molecule, noise, solver_steps=self.solver_steps,
                 solver=self.solver,
                 last_velocities_nm_ps=None if turned is None else torch.from_numpy(turned.astype(np.float32)),
-            )
+            )  # fmt: skip
         usual = self.solver_steps if self._model.solvers else 1
         self.drawn += len(seeds)
         self.evaluations += len(seeds) * (usual if chunk.evaluations is None else chunk.evaluations)
@@ -187,7 +198,439 @@ def _alike(velocities: FloatArray | None, n: int) -> list[npt.NDArray[np.int64]]
 
 
 def _out_of_memory(error: BaseException) -> bool:
-    if isinstance(error, MemoryError | torch.OutOfMemoryError):
+    words = ("out of memory", "not enough memory", "can't allocate memory")
+    return isinstance(error, MemoryError | torch.OutOfMemoryError) or any(w in str(error).lower() for w in words)
+
+
+# Guard of a rollout: checks every frame as it is made, before it is written or conditions the next chunk.
+
+Flags = npt.NDArray[np.uint16]
+# Any of these bits, and a frame does not pass.
+CAUGHT = (
+    validity.INVALID
+    | validity.ANGLE
+    | validity.PLANARITY
+    | validity.JUMP
+    | validity.DRIFT
+    | validity.ENERGY
+    | validity.STILL
+    | validity.UNSURE
+)
+
+
+class Guard:
+    """The checks of one training domain, with thresholds that its reference set (`systems.chemistry.validity`,
+    `.limits`)."""
+
+    def __init__(self, domain: TrainingDomain) -> None:
+        self._geometry = validity.Geometry.from_dict(domain.geometry)
+        self._limits = None if domain.limits is None else validity.Limits.from_dict(domain.limits)
+
+    @property
+    def unchecked(self) -> tuple[str, ...]:
+        """What is not checked, because the reference changes it or the weights are older than the check."""
+        missing: tuple[str, ...] = ()
+        if self._limits is None:
+            missing = ("angles, flat centres, jumps, stillness and drift: the weights carry no limits",)
+        elif self._limits.jump_min_nm == 0.0:
+            missing = ("stillness: the weights carry no limit of it",)
+        return (*self._geometry.excluded, *missing)
+
+    def check(self, frames_nm: FloatArray, before_nm: FloatArray, *, from_start: bool = False) -> Flags:
+        """Return the flags `(b, n)` of frames `(b, n, n_atoms, 3)` nm that follow `before_nm (b, n_atoms, 3)`.
+
+        `from_start`: the frames before are the user's structure, which need not be one of the ensemble, so that the
+        first step away from it does not count as a jump.
+        """
+        n_rows, n_frames = frames_nm.shape[:2]
+        flat = frames_nm.reshape(-1, *frames_nm.shape[2:])
+        flags = validity.check_frames(flat, self._geometry)
+        if self._limits is not None:
+            previous = np.concatenate([before_nm[:, None], frames_nm[:, :-1]], axis=1).reshape(flat.shape)
+            found = validity.check_limits(flat, self._limits, previous).reshape(n_rows, n_frames)
+            if from_start:
+                found[:, 0] &= ~np.uint16(validity.JUMP | validity.DRIFT)
+            flags |= found.reshape(-1)
+        return flags.reshape(n_rows, n_frames)
+
+
+def caught(flags: Flags) -> npt.NDArray[np.bool_]:
+    """Return which frames do not pass."""
+    return cast(npt.NDArray[np.bool_], (flags & np.uint16(CAUGHT)) != 0)
+
+
+# The column `intervention` of a trajectory: what a frame is, if it is not the surrogate's first draw.
+DRAWN_AGAIN, REPAIRED, MD_AFTER_FAILURE, MD_BETWEEN = 1, 2, 3, 4
+MARKS = {
+    DRAWN_AGAIN: "drawn again",
+    REPAIRED: "repaired",
+    MD_AFTER_FAILURE: "MD after a failure",
+    MD_BETWEEN: "MD between chunks",
+}
+# What frames of each kind may do to the statistics of a trajectory.
+BIAS = {
+    DRAWN_AGAIN: "states from which the surrogate fails are visited less, and left in other ways",
+    REPAIRED: "repaired frames and those that follow from them have relaxed bonds and angles, colder than the "
+    "ensemble's",
+    MD_AFTER_FAILURE: "MD stands where the surrogate failed: ensemble and kinetics are a mixture, and each stretch of "
+    "MD starts from a relaxed frame with new velocities and warms up within about 1 ps",
+    MD_BETWEEN: "MD stands between chunks: ensemble and kinetics are a mixture of the two",
+}
+_LOGGED = 200
+
+
+@dataclass
+class Tally:
+    """One replica's summary. All numbers are of model frames, whether they are kept in the file or not.
+
+    `chunks` drawn, of which `chunks_caught` held a frame that a guard caught; `frames_caught` and `reasons` count the
+    frames of first draws, `frames` those that an intervention left, `draws` the further draws. `md_in_a_row`: chunks
+    that MD had to finish since the surrogate last got through one. `invalid_in_a_row`: frames of the chunks since the
+    last one that held a valid frame. `log` holds the first 200 interventions.
+    """
+
+    chunks: int = 0
+    chunks_caught: int = 0
+    frames_caught: int = 0
+    reasons: dict[str, int] = field(default_factory=dict)
+    frames: dict[str, int] = field(default_factory=dict)
+    draws: int = 0
+    md_in_a_row: int = 0
+    invalid_in_a_row: int = 0
+    log: list[dict[str, Any]] = field(default_factory=list)
+
+    def note_caught(self, flags: npt.NDArray[np.uint16], first_step: int) -> None:
+        """Enter the caught frames of a first draw, `flags (k,)` each with its bits; `first_step` is the earliest's."""
+        self.chunks_caught += 1
+        self.frames_caught += len(flags)
+        names = Counter(name for bits in flags.tolist() for name in validity.flag_names(bits))
+        for name, count in names.items():
+            self.reasons[name] = self.reasons.get(name, 0) + count
+        if len(self.log) < _LOGGED:
+            self.log.append({"chunk": self.chunks, "step": first_step, "reasons": sorted(names)})
+
+    def note_marks(self, marks: npt.NDArray[np.uint8]) -> None:
+        """Enter what the frames of a finished chunk are, `marks (n,)`."""
+        for mark, name in MARKS.items():
+            count = int((marks == mark).sum())
+            if count:
+                self.frames[name] = self.frames.get(name, 0) + count
+
+    def to_record(self) -> dict[str, Any]:
+        """Return what a trajectory's record keeps of it."""
+        kept = {k: v for k, v in asdict(self).items() if not k.endswith("_in_a_row")}
+        bias = [why for mark, why in BIAS.items() if self.frames.get(MARKS[mark])]
+        return {**kept, "share_of_chunks": self.chunks_caught / max(self.chunks, 1), "bias": bias}
+
+
+@contextmanager
+def timed(seconds: dict[str, float], what: str) -> Iterator[None]:
+    """Add the wall time that the block takes to what a batch has spent on `what`."""
+    started = perf_counter()
+    try:
+        yield
+    finally:
+        seconds[what] = seconds.get(what, 0.0) + perf_counter() - started
+
+
+MOST_DRAWS = 8
+_DRAWS_FROM_LAST_VALID = 4
+MOST_MD_IN_A_ROW = 10
+# Invalid frames, after which unguarded rollouts end: a clash passes, a molecule that came apart does not.
+MOST_INVALID_IN_A_ROW = 4
+_MD_ATTEMPT, _BETWEEN_ATTEMPT = 1000, 2000
+# Under 'flag': so many chunks of each replica a model has to get one through. A frame now and then, as sound weights
+# have in long chunks, does not prove it wrong: of frames, so many must be caught, and more than one.
+_CHUNKS_TO_PROVE = 8
+_WRONG_SHARE = 0.1
+
+
+@dataclass(eq=False)
+class Chunk:
+    """Frames of all replicas: positions `(b, n, n_atoms, 3)` nm; flags, marks (`MARKS`) and, where they were
+    computed, what the energy check found in kJ/mol, `(b, n)`; velocities `(b, n_atoms, 3)` nm/ps at the end, of a model
+    that carries them, NaN where they are unknown. `failure`: why the rollout cannot go on, and in which replica."""
+
+    frames_nm: FloatArray
+    flags: Flags
+    marks: npt.NDArray[np.uint8]
+    energies_kj_mol: npt.NDArray[np.float64]
+    velocities_nm_ps: FloatArray | None
+    failure: tuple[int, str] | None = None
+
+
+def none_through(tallies: Sequence[Tally], n_new: int, *, at_end: bool) -> tuple[int, str] | None:
+    """Return the worst replica and what is wrong, where a model has drawn no chunk of `n_new` frames that passes.
+
+    None as long as one has passed, or may yet: `at_end` says that no chunk follows.
+    """
+    chunks, frames = sum(t.chunks for t in tallies), sum(t.frames_caught for t in tallies)
+    if any(t.chunks_caught < t.chunks for t in tallies) or frames <= max(1.0, _WRONG_SHARE * chunks * n_new):
+        return None
+    if not at_end and tallies[0].chunks < _CHUNKS_TO_PROVE:
+        return None
+    row = max(range(len(tallies)), key=lambda k: tallies[k].frames_caught)
+    reasons: Counter[str] = Counter()
+    for tally in tallies:
+        reasons.update(tally.reasons)
+    which = f"every one of {chunks} chunks" if chunks > 1 else "its one chunk"
+    named = ", ".join(name for name, _ in reasons.most_common())
+    return row, f"{which} was caught ({100 * frames / (chunks * n_new):.0f} % of frames: {named})"
+
+
+@dataclass(frozen=True, eq=False)
+class Interventions:
+    """Draws chunks and treats frames that the checks caught as `guard` says (`surrogate.sampling.config.GUARDS`).
+
+    `coupling` is needed by 'repair', 'fallback' and `n_between` (frames of MD after each chunk); `energy` checks every
+    `energy_every`-th frame, `spread` every frame of a learned potential.
+    """
+
+    sampler: ChunkSampler
+    checks: Guard
+    guard: str
+    seed: int
+    # Wall seconds of the batch by what they went into: draw, check, draw again, relax, md, energy, energy limit.
+    seconds: dict[str, float]
+    coupling: Coupling | None = None
+    energy_every: int = 0
+    n_between: int = 0
+    energy: EnergyCheck | None = None
+    spread: MemberSpread | None = None
+
+    def advance(
+        self, last_nm: FloatArray, velocities_nm_ps: FloatArray | None, tallies: Sequence[Tally], *, chunk: int,
+        step: int,
+    ) -> Chunk:  # fmt: skip
+        """Return the chunk number `chunk` after `last_nm (b, n_conditioning, n_atoms, 3)`, `step` frames into the run.
+
+        Tallies are brought up to date. Frames stand in it as they are to be written; where `failure` is set, the
+        rollout must stop.
+        """
+        run = _Advance(self, last_nm, velocities_nm_ps, tallies, chunk, step)
+        run.draw()
+        if self.guard not in ("off", "flag"):
+            run.help_rows()
+        run.compare()
+        if self.n_between and run.chunk.failure is None:
+            run.add_md()
+        for tally, marks in zip(tallies, run.chunk.marks, strict=True):
+            tally.note_marks(marks)
+            tally.chunks += 1
+        return run.chunk
+
+
+@dataclass(eq=False)
+class _Advance:
+    """One chunk in the making."""
+
+    plan: Interventions
+    last: FloatArray
+    velocities: FloatArray | None
+    tallies: Sequence[Tally]
+    number: int
+    step: int
+    chunk: Chunk = field(init=False)
+
+    def draw(self) -> None:
+        with timed(self.plan.seconds, "draw"):
+            drawn = self.plan.sampler.draw(self.last, self._seeds(range(len(self.last)), 0), self.velocities)
+        shape = drawn.frames_nm.shape[:2]
+        flags, marks = np.zeros(shape, dtype=np.uint16), np.zeros(shape, dtype=np.uint8)
+        self.chunk = Chunk(drawn.frames_nm, flags, marks, np.full(shape, np.nan), drawn.velocities_nm_ps)
+        self._check(np.arange(shape[0]))
+        for row, tally in enumerate(self.tallies):
+            bad = np.flatnonzero(caught(self.chunk.flags[row]))
+            if len(bad):
+                tally.note_caught(self.chunk.flags[row, bad], self.step + 1 + int(bad[0]))
+
+    def help_rows(self) -> None:
+        """Replace caught frames by further draws, repair or MD; `chunk.failure` says which row could not be helped."""
+        pending = self._caught_rows()
+        none_passed = {row for row in pending if self._none_passes(row)}
+        for attempt in range(MOST_DRAWS + 1):
+            if attempt:
+                self._draw_again(pending, attempt)
+            wrong = [row for row in pending if attempt == 1 and row in none_passed and self._is_wrong(row)]
+            if wrong:
+                self.chunk.failure = (wrong[0], f"two draws gave no frame that passes ({self._reasons(wrong[0])})")
+                return
+            pending = [row for row in pending if not self._resolve(row, attempt)]
+            if not pending:
+                return
+        first = pending[0]
+        what = f"{MOST_DRAWS} further draws gave no chunk that passes ({self._reasons(first)})"
+        if self.tallies[first].md_in_a_row > MOST_MD_IN_A_ROW:
+            what = f"MD had to finish {MOST_MD_IN_A_ROW} chunks in a row, and {what}"
+        self.chunk.failure = (first, what)
+
+    def compare(self) -> None:
+        """Enter in `chunk.failure` the row whose last frame is not finite, or which under 'flag' has had no valid frame
+        for a whole chunk, or for as many short ones as hold MOST_INVALID_IN_A_ROW frames."""
+        if self.chunk.failure is not None:
+            return
+        for row in range(len(self.last)):
+            if self.chunk.flags[row, -1] & validity.NOT_FINITE or not np.isfinite(self.chunk.frames_nm[row, -1]).all():
+                self.chunk.failure = (row, "the model's frames are no longer finite")
+                continue
+            invalid = (self.chunk.flags[row] & np.uint16(validity.INVALID | validity.STILL)).all()
+            tally = self.tallies[row]
+            tally.invalid_in_a_row = tally.invalid_in_a_row + self.chunk.flags.shape[1] if invalid else 0
+            if self.plan.guard == "flag" and tally.invalid_in_a_row >= MOST_INVALID_IN_A_ROW:
+                self.chunk.failure = (row, f"{tally.invalid_in_a_row} frames and no valid one ({self._reasons(row)})")
+
+    def add_md(self) -> None:
+        """Append a stretch of MD to every row."""
+        assert self.plan.coupling is not None
+        chunk, n = self.chunk, self.plan.n_between
+        starts = chunk.frames_nm[:, -1]
+        added = np.empty((len(starts), n, *starts.shape[1:]), dtype=chunk.frames_nm.dtype)
+        for row, start in enumerate(starts):
+            try:
+                with timed(self.plan.seconds, "md"):
+                    segment = self.plan.coupling.simulate(start, n, seed=self._seed(row, _BETWEEN_ATTEMPT))
+            except SimulationError as error:
+                chunk.failure = (row, f"MD cannot go on from the last frame of a chunk: {error}")
+                return
+            added[row] = segment.frames_nm
+            if chunk.velocities_nm_ps is not None:
+                chunk.velocities_nm_ps[row] = segment.velocities_nm_ps
+        flags = self.plan.checks.check(added, starts)
+        marks = np.full(flags.shape, MD_BETWEEN, dtype=np.uint8)
+        chunk.frames_nm = np.concatenate([chunk.frames_nm, added], axis=1)
+        chunk.flags = np.concatenate([chunk.flags, flags], axis=1)
+        chunk.marks = np.concatenate([chunk.marks, marks], axis=1)
+        chunk.energies_kj_mol = np.concatenate([chunk.energies_kj_mol, np.full(flags.shape, np.nan)], axis=1)
+
+    def _resolve(self, row: int, attempt: int) -> bool:
+        """Do what the guard says about a row that was just drawn; return whether it can stay as it is then. A first
+        draw without a frame that passes is not worth it: there is another."""
+        bad = np.flatnonzero(caught(self.chunk.flags[row]))
+        if not len(bad):
+            self.tallies[row].md_in_a_row = 0
+            return True
+        if attempt == 0 and self._none_passes(row):
+            return False
+        if self.plan.guard == "repair":
+            return self._repair(row)
+        return self.plan.guard == "fallback" and self._fall_back(row, int(bad[0]))
+
+    def _repair(self, row: int) -> bool:
+        """Relax the caught frames of a row, first to last; return whether all of them are valid then."""
+        assert self.plan.coupling is not None
+        while True:
+            bad = np.flatnonzero(caught(self.chunk.flags[row]))
+            if not len(bad):
+                return True
+            frame = int(bad[0])
+            if self.chunk.marks[row, frame] == REPAIRED:
+                return False
+            try:
+                with timed(self.plan.seconds, "relax"):
+                    relaxed = self.plan.coupling.relax(self.chunk.frames_nm[row, frame])
+            except SimulationError:
+                return False
+            self.chunk.frames_nm[row, frame] = relaxed.positions_nm
+            self.chunk.marks[row, frame] = REPAIRED
+            self.chunk.energies_kj_mol[row, frame] = np.nan
+            self._check(np.array([row]))
+
+    def _fall_back(self, row: int, first: int) -> bool:
+        """Replace a row from frame `first` on by MD; return whether it could be done."""
+        assert self.plan.coupling is not None
+        tally = self.tallies[row]
+        tally.md_in_a_row += 1
+        if tally.md_in_a_row > MOST_MD_IN_A_ROW:
+            return False
+        n = self.chunk.frames_nm.shape[1] - first
+        try:
+            with timed(self.plan.seconds, "md"):
+                segment = self.plan.coupling.simulate(
+                    self._history(row, first)[-1], n, seed=self._seed(row, _MD_ATTEMPT)
+                )
+        except SimulationError:
+            return False
+        self._replace(row, first, segment.frames_nm, MD_AFTER_FAILURE)
+        if self.chunk.velocities_nm_ps is not None:
+            self.chunk.velocities_nm_ps[row] = segment.velocities_nm_ps
+        self._check(np.array([row]))
         return True
-    text = str(error).lower()
-    return any(words in text for words in ("out of memory", "not enough memory", "can't allocate memory"))
+
+    def _draw_again(self, rows: Sequence[int], attempt: int) -> None:
+        """Draw the rows anew, each from its last valid frame, or from where the chunk began once that has failed."""
+        keep = attempt <= _DRAWS_FROM_LAST_VALID
+        firsts = [int(np.argmax(caught(self.chunk.flags[row]))) if keep else 0 for row in rows]
+        histories = np.stack([self._history(row, first) for row, first in zip(rows, firsts, strict=True)])
+        velocities = None
+        if self.chunk.velocities_nm_ps is not None:
+            velocities = np.full((len(rows), *self.last.shape[2:]), np.nan)
+            for k, (row, first) in enumerate(zip(rows, firsts, strict=True)):
+                if first == 0 and self.velocities is not None:
+                    velocities[k] = self.velocities[row]
+        with timed(self.plan.seconds, "draw again"):
+            drawn = self.plan.sampler.draw(histories, self._seeds(rows, attempt), velocities)
+        for k, (row, first) in enumerate(zip(rows, firsts, strict=True)):
+            self.tallies[row].draws += 1
+            self._replace(row, first, drawn.frames_nm[k, : drawn.frames_nm.shape[1] - first], DRAWN_AGAIN)
+            if self.chunk.velocities_nm_ps is not None and drawn.velocities_nm_ps is not None:
+                # Those of the draw belong to its last frame, which is cut off where the row began before it.
+                self.chunk.velocities_nm_ps[row] = drawn.velocities_nm_ps[k] if first == 0 else np.nan
+        self._check(np.asarray(rows))
+
+    def _replace(self, row: int, first: int, frames_nm: FloatArray, mark: int) -> None:
+        self.chunk.frames_nm[row, first:] = frames_nm
+        self.chunk.marks[row, first:] = mark
+        self.chunk.energies_kj_mol[row, first:] = np.nan
+
+    def _history(self, row: int, first: int) -> FloatArray:
+        """The frames `(n_conditioning, n_atoms, 3)` before frame `first` of a row."""
+        n = self.last.shape[1]
+        return np.concatenate([self.last[row], self.chunk.frames_nm[row, :first]])[-n:]
+
+    def _check(self, rows: npt.NDArray[np.int64]) -> None:
+        with timed(self.plan.seconds, "check"):
+            frames, before = self.chunk.frames_nm[rows], self.last[rows, -1]
+            flags = self.plan.checks.check(frames, before, from_start=self.step == 0)
+            if self.plan.spread is not None:
+                flags |= np.uint16(validity.UNSURE) * self.plan.spread.unsure(frames)
+            self.chunk.flags[rows] = flags
+        if self.plan.energy is not None:
+            with timed(self.plan.seconds, "energy limit"):
+                _ = self.plan.energy.limit
+            with timed(self.plan.seconds, "energy"):
+                for row in rows.tolist():
+                    self._check_energies(row, self.plan.energy)
+
+    def _check_energies(self, row: int, check: EnergyCheck) -> None:
+        """Flag frames whose turn it is and whose energy is none that the reference has."""
+        steps = self.step + 1 + np.arange(self.chunk.flags.shape[1])
+        energies = self.chunk.energies_kj_mol[row]
+        for k in np.flatnonzero((steps % self.plan.energy_every == 0) & ~caught(self.chunk.flags[row])).tolist():
+            if np.isnan(energies[k]):
+                energies[k] = check.value(self.chunk.frames_nm[row, k])
+            if check.fails(energies[k]):
+                self.chunk.flags[row, k] |= np.uint16(validity.ENERGY)
+
+    def _caught_rows(self) -> list[int]:
+        rows: list[int] = np.flatnonzero(caught(self.chunk.flags).any(axis=1)).tolist()
+        for row, tally in enumerate(self.tallies):
+            if row not in rows:
+                tally.md_in_a_row = 0
+        return rows
+
+    def _is_wrong(self, row: int) -> bool:
+        """Whether no frame of this caught row passes, and no earlier chunk of it has got through without help."""
+        tally = self.tallies[row]
+        return self._none_passes(row) and tally.chunks == tally.chunks_caught - 1
+
+    def _none_passes(self, row: int) -> bool:
+        return bool(caught(self.chunk.flags[row]).all())
+
+    def _reasons(self, row: int) -> str:
+        return ", ".join(validity.flag_names(int(np.bitwise_or.reduce(self.chunk.flags[row]))))
+
+    def _seed(self, row: int, attempt: int) -> int:
+        return noise_seed(self.plan.seed, row, self.number, attempt)
+
+    def _seeds(self, rows: Sequence[int] | range, attempt: int) -> list[int]:
+        return [self._seed(row, attempt) for row in rows]

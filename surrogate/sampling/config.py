@@ -19,7 +19,7 @@ class RolloutConfig:
     one that its model knows. `precision` 'bf16' is autocast of the network (coordinates and integration stay fp32),
     'auto' is bf16 where the processor multiplies it faster.
 
-    `guard`: see `surrogate.sampling.interventions`. `energy_every`: k, the energy of every k-th model frame is
+    `guard`: see `surrogate.sampling.chunks`. `energy_every`: k, the energy of every k-th model frame is
     checked, after stiff bonds are relaxed; 0 checks none. `anneal_ps`: before its first frame each replica of a learned
     potential moves for so long, from 600 K down to its temperature, so that torsions that turn seldom start all over.
     `select` and `atoms` say which atoms are written; all are computed. Raises InputError.

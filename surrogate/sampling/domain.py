@@ -14,14 +14,13 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
-from surrogate.data.frames import in_standard_pose
-from surrogate.data.shipped import shipped_weights
-from surrogate.models.architecture import architecture
+from surrogate.data import in_standard_pose
+from surrogate.models.architecture import architecture, shipped_weights
 from surrogate.models.peptides.chains import FREE_ENDS
 from surrogate.models.peptides.layout import PeptideConfig, chain_features, standard_peptide
 from surrogate.models.peptides.model import PeptideSlide
 from surrogate.models.potential import Potential
-from surrogate.models.weights import load_weights, read_header
+from surrogate.models.weights import TrainingDomain, Weights, load_weights, read_header
 from systems.chemistry.graph import bonded_graph, match_atoms, rotatable_torsions
 from systems.chemistry.validity import INVALID, NOT_FINITE, Geometry, check_frames, flag_names, geometry_from_scene
 from systems.errors import InputError, OutOfDomainError
@@ -30,19 +29,13 @@ from systems.units import format_time_ps
 
 if TYPE_CHECKING:
     from surrogate.models.propagator import Propagator
-from surrogate.models.weights import TrainingDomain, Weights
-
-# Coverage of a scene by a training domain, and the ways in which one leaves it.
 
 
 @dataclass(frozen=True)
 class Deviation:
-    """One way in which a scene leaves the training domain.
-
-    `what`: elements, size, charge, bond types, torsion environments, connectivity, stereo, start or temperature, of an
-    unseen peptide also residues or ends. `reason`: the two sides, in words. `forcible`: whether the model can be run
-    nevertheless.
-    """
+    """One way in which a scene leaves the training domain: `what` (elements, size, charge, bond types, torsion
+    environments, connectivity, stereo, start or temperature, of an unseen peptide also residues or ends), the `reason`
+    in words, and whether the model can be run nevertheless (`forcible`)."""
 
     what: str
     reason: str
@@ -54,10 +47,8 @@ class Deviation:
 
 
 def member_of(scene: Scene, domain: TrainingDomain) -> TrainingDomain | None:
-    """Return the domain of the one molecule that a scene is, of all that weights were trained on; None of another.
-
-    Weights for one molecule have one domain, and it is returned whatever the scene.
-    """
+    """Return the domain of the one molecule that a scene is, of all that weights were trained on; None of another. The
+    one domain of weights for one molecule is returned whatever the scene."""
     if not domain.transferable:
         return domain
     for member in domain.members:
@@ -69,22 +60,8 @@ def member_of(scene: Scene, domain: TrainingDomain) -> TrainingDomain | None:
     return None
 
 
-def compare_sets(
-    what: str, scene: Scene, known: list[Scene], of: Callable[[Scene], set[str]], *, forcible: bool
-) -> list[Deviation]:
-    """Return a deviation that names what `of(scene)` holds and that of no known scene does."""
-    new = sorted(of(scene) - set().union(*(of(one) for one in known)))
-    if not new:
-        return []
-    listed = ", ".join(new[:6]) + (f" and {len(new) - 6} more" if len(new) > 6 else "")
-    return [Deviation(what, f"{listed} not seen in training", forcible=forcible)]
-
-
 def bond_types(scene: Scene) -> set[str]:
-    """Return the kinds of bonds by elements and order: {'C-H', 'C=O', 'C:N', ...}; ~ where no order is given.
-
-    A bond between C, N or O inside an aromatic ring or a delocalised group has the order that its source draws.
-    """
+    """Return the kinds of bonds by elements and order: {'C-H', 'C=O', 'C:N', ...}; ~ where no order is given."""
     symbol = {0.0: "~", 1.0: "-", 1.5: ":", 2.0: "=", 3.0: "#"}
     kinds = set()
     for (i, j), order in zip(scene.bonds.tolist(), scene.bond_orders.tolist(), strict=True):
@@ -94,10 +71,8 @@ def bond_types(scene: Scene) -> set[str]:
 
 
 def torsion_environments(scene: Scene) -> set[str]:
-    """Return the surroundings of each rotatable bond: the two atoms, each with its other neighbours.
-
-    'C(C,H,N)-C(N,O)' is psi of alanine. Names, order and positions play no part.
-    """
+    """Return the surroundings of each rotatable bond, the two atoms with their other neighbours: 'C(C,H,N)-C(N,O)' is
+    psi of alanine."""
     near = scene.neighbours()
 
     def end(atom: int, other: int) -> str:
@@ -107,8 +82,6 @@ def torsion_environments(scene: Scene) -> set[str]:
     return {"-".join(sorted((end(b, c), end(c, b)))) for _, b, c, _ in rotatable_torsions(scene).tolist()}
 
 
-# Peptides that weights by residues cover: any chain of residues that were trained on, whatever its sequence.
-
 _CAPS = ("ACE", "NME", "NH2")
 
 
@@ -117,11 +90,10 @@ def cover_peptide(
 ) -> tuple[TrainingDomain, npt.NDArray[np.int64], tuple[Deviation, ...]]:
     """Return the domain of an unseen peptide, the order of its atoms in the model, and how it leaves the training.
 
-    The molecule is the scene under standard names; a valid frame has the bond lengths and angles that residues of its
-    kinds have on average in the training references. A residue, or an end of a chain, that no training peptide has
-    cannot be forced; more residues than any of them has, and a strained start, can. So can a residue at a free end that
-    none has there, whose side chain the charge turns elsewhere, and more residues between free ends than any has, since
-    what charges do to each other reaches along a chain.
+    The molecule is the scene under standard names; a valid frame has the bond lengths and angles that such residues
+    have on average in the training references. A residue, or an end of a chain, that no training peptide has cannot be
+    forced; more residues than any of them has, with free ends or without, a residue at a free end that none has there,
+    and a strained start can.
     """
     try:
         standard, order = standard_peptide(scene)
@@ -179,17 +151,12 @@ def _n_amino_acids(scene: Scene) -> int:
     return sum(name not in _CAPS for name in scene.residue_names)
 
 
-# Lag of a rollout, the time between its frames: the weights' one spacing, or any in the range of their training.
-
 _ROUNDING = 1e-6
 
 
 def choose_lag(weights: Weights, lag_ps: float | None, save_every_ps: float | None) -> float:
-    """Return the lag of a rollout: the one asked for, else the longest that the save interval is a multiple of, so that
-    no frame is computed that nobody keeps; without either the shortest. Weights for one lag have that one.
-
-    Raises InputError for a lag that the weights were not trained for.
-    """
+    """Return the lag of a rollout: the one asked for, else the longest that the save interval is a multiple of, without
+    either the shortest. Raises InputError for a lag that the weights were not trained for."""
     domain, name = weights.domain, weights.path.name
     low, high = domain.lag_ps, domain.longest_lag_ps
     if not domain.jumps:
@@ -209,8 +176,7 @@ def choose_lag(weights: Weights, lag_ps: float | None, save_every_ps: float | No
 
 
 def at_lag(weights: Weights, domain: TrainingDomain, lag_ps: float) -> Weights:
-    """Return the weights with a model that steps `lag_ps`, for one molecule's `domain`, with limits of jumps at that
-    lag."""
+    """Return the weights for one molecule's `domain` with a model that steps `lag_ps`, and limits of jumps at it."""
     if not domain.jumps:
         return weights if domain is weights.domain else replace(weights, domain=domain)
     limits = domain.limits
@@ -225,11 +191,6 @@ def at_lag(weights: Weights, domain: TrainingDomain, lag_ps: float) -> Weights:
     )
 
 
-__all__ = [
-    "Deviation", "DomainMatch", "bond_types", "find_deviations", "fit_weights", "match_domain",
-    "match_known", "match_scene",
-    "torsion_environments",
-]  # fmt: skip
 # A model that does not take the temperature as an input has one; a thermostat is set more finely than this by nobody.
 TEMPERATURE_TOLERANCE_K = 0.5
 
@@ -257,24 +218,17 @@ class DomainMatch:
 def find_deviations(
     scene: Scene, domain: TrainingDomain, *, model: Propagator | None = None, temperature_k: float | None = None
 ) -> tuple[Deviation, ...]:
-    """Return how a scene leaves a training domain, the gravest first; nothing where the weights cover it.
-
-    `model`: of these weights; one that knows peptides by residues covers other sequences, too.
-
-    Compared are elements, the number of atoms, the total charge, bond types (elements and order), the surroundings of
-    rotatable bonds, connectivity, stereo, the starting structure (by the validity of the training reference's frames)
-    and the temperature, where one is asked for.
-    """
+    """Return how a scene leaves a training domain, the gravest first; nothing where the weights cover it. `model`: of
+    these weights; one that knows peptides by residues covers other sequences, too."""
     return _compare(scene, domain, None if model is None else _peptides(model), temperature_k).deviations
 
 
 def match_domain(
     scene: Scene, weights: Weights, *, temperature_k: float | None = None, force: bool = False
 ) -> DomainMatch:
-    """Return the order of a scene's atoms in the model, and what of the training domain it leaves under `force`.
+    """Return the order of a scene's atoms in the model, and what of the training domain it leaves under `force`:
+    another stereoisomer, a strained start and another temperature can be forced, other atoms or bonds cannot.
 
-    A model has one place for each atom of its template, so a scene with other atoms or bonds cannot be forced; another
-    stereoisomer, a strained start and another temperature can, and the rollout's record says so.
     Raises OutOfDomainError, which says how the scene differs, what the weights cover and what to run instead.
     """
     return match_known(scene, weights.domain, weights.path.name, _peptides(weights.model),
@@ -285,19 +239,17 @@ def match_known(
     scene: Scene, domain: TrainingDomain, name: str, peptides: PeptideConfig | None = None, *,
     temperature_k: float | None = None, force: bool = False,
 ) -> DomainMatch:  # fmt: skip
-    """`match_domain` for weights that are not loaded, of which a file's header tells all that counts: `peptides` are
-    the settings of a model that knows peptides by their residues."""
+    """`match_domain` for weights that are not loaded; `peptides`: the settings of a model that knows peptides by their
+    residues."""
     found = _compare(scene, domain, peptides, temperature_k)
     deviations = found.deviations
     barred = [d for d in deviations if not d.forcible]
     if not barred and (force or not deviations):
         return found
     reasons = "; ".join(f"{d.what}: {d.reason}" for d in deviations)
-    advice = (
-        "Run `surromd reference` for this molecule, then `surromd train` on it."
-        if barred
-        else "Run `surromd reference` for it instead, or roll with `force=True`: the trajectory is then marked."
-    )
+    advice = "Run `surromd reference` for it instead, or roll with `force=True`: the trajectory is then marked."
+    if barred:
+        advice = "Run `surromd reference` for this molecule, then `surromd train` on it."
     raise OutOfDomainError(
         f"{name} does not cover {scene.name}: {reasons}. These weights cover {domain.describe()}. {advice}",
         brief=f"{name} does not cover it: {reasons}",
@@ -306,18 +258,11 @@ def match_known(
 
 
 def fit_weights(
-    scene: Scene,
-    weights: Weights,
-    *,
-    temperature_k: float | None = None,
-    force: bool = False,
-    lag_ps: float | None = None,
-    save_every_ps: float | None = None,
-) -> tuple[Weights, DomainMatch]:
-    """Return weights as a rollout of this scene takes them, for one molecule at one lag, and the match to that.
-
-    Raises OutOfDomainError as `match_domain` does, InputError for a lag that the weights were not trained for.
-    """
+    scene: Scene, weights: Weights, *, temperature_k: float | None = None, force: bool = False,
+    lag_ps: float | None = None, save_every_ps: float | None = None,
+) -> tuple[Weights, DomainMatch]:  # fmt: skip
+    """Return weights as a rollout of this scene takes them, for one molecule at one lag, and the match to that. Raises
+    OutOfDomainError as `match_domain` does, InputError for a lag that the weights were not trained for."""
     match = match_domain(scene, weights, temperature_k=temperature_k, force=force)
     return at_lag(weights, match.domain, choose_lag(weights, lag_ps, save_every_ps)), match
 
@@ -333,18 +278,10 @@ def in_bath(weights: Weights, asked: dict[str, Any]) -> Weights:
     if not asked:
         return weights
     model, domain = weights.model.in_bath(asked), weights.domain
-    told = {name: value for name, value in asked.items() if name in domain.conditions}
+    changed = {name: value for name, value in asked.items() if name in domain.conditions}
     if "constrain_hydrogens" in domain.conditions:
-        told["constrain_hydrogens"] = model.config.constrain_hydrogens
-    return replace(weights, model=model, domain=replace(domain, conditions={**domain.conditions, **told}))
-
-
-def match_scene(scene: Scene, weights: Weights) -> npt.NDArray[np.int64]:
-    """Return `order (n_atoms,)` of a scene that the weights cover: model atom k is scene atom order[k].
-
-    Raises OutOfDomainError; see `match_domain`.
-    """
-    return match_domain(scene, weights).order
+        changed["constrain_hydrogens"] = model.config.constrain_hydrogens
+    return replace(weights, model=model, domain=replace(domain, conditions={**domain.conditions, **changed}))
 
 
 def _peptides(model: Propagator) -> PeptideConfig | None:
@@ -381,17 +318,22 @@ def _compare_molecules(scene: Scene, template: Scene) -> tuple[npt.NDArray[np.in
         return match_atoms(scene, template), []
     except OutOfDomainError as error:
         refusal = str(error).rstrip(".")
-    found = [
-        *compare_sets("elements", scene, [template], lambda s: set(s.elements), forcible=False),
-        *_compare_sizes(scene, template),
-        *compare_sets("bond types", scene, [template], bond_types, forcible=False),
-        *compare_sets("torsion environments", scene, [template], torsion_environments, forcible=False),
-    ]
-    if found or scene.interactions != template.interactions:
-        return np.arange(0), found or [Deviation("connectivity", refusal, forcible=False)]
-    order = _order_without_stereo(scene, template)
+    found: list[Deviation] = []
+
+    def compare(what: str, of: Callable[[Scene], set[str]]) -> None:
+        if new := sorted(of(scene) - of(template)):
+            listed = ", ".join(new[:6]) + (f" and {len(new) - 6} more" if len(new) > 6 else "")
+            found.append(Deviation(what, f"{listed} not seen in training", forcible=False))
+
+    compare("elements", lambda s: set(s.elements))
+    found += _compare_sizes(scene, template)
+    compare("bond types", bond_types)
+    compare("torsion environments", torsion_environments)
+    order = None
+    if not found and scene.interactions == template.interactions:
+        order = _order_without_stereo(scene, template)
     if order is None:
-        return np.arange(0), [Deviation("connectivity", refusal, forcible=False)]
+        return np.arange(0), found or [Deviation("connectivity", refusal, forcible=False)]
     return order, [Deviation("stereo", refusal, forcible=True)]
 
 
@@ -417,10 +359,8 @@ def _compare_start(scene: Scene, order: npt.NDArray[np.int64], geometry: Geometr
 def _order_without_stereo(scene: Scene, template: Scene) -> npt.NDArray[np.int64] | None:
     """Return an order that keeps elements and bonds, and every handedness of the mirror image where that fits."""
     mirrored = scene.with_positions(scene.positions_nm * np.array([1.0, 1.0, -1.0]))
-    try:
+    with suppress(OutOfDomainError):
         return match_atoms(mirrored, template)
-    except OutOfDomainError:
-        pass
     from networkx.algorithms.isomorphism import GraphMatcher, categorical_node_match
 
     matcher = GraphMatcher(
@@ -430,19 +370,14 @@ def _order_without_stereo(scene: Scene, template: Scene) -> npt.NDArray[np.int64
     return None if image is None else np.array([image[k] for k in range(template.n_atoms)], dtype=np.int64)
 
 
-# Choice of the shipped weights that roll a scene, where the user names none.
-
-
 def choose_weights(
     scene: Scene, *, temperature_k: float | None = None, conditions: Mapping[str, Any] | None = None
 ) -> tuple[Weights, str]:
-    """Return the shipped weights that cover a scene, and why these.
+    """Return the shipped weights that cover a scene, and why these: trained on the molecule before those that know
+    molecules like it, drawing frames before potentials, which take far longer, for several lags before one.
 
-    Weights that were trained on the molecule come before those that know molecules like it; those that draw frames
-    before potentials, which take far longer; those that step as far as frames are saved before those for one lag.
-    Headers tell all of this: only those chosen are loaded.
-    `conditions`: force field and solvent that they must have been trained under; all do where nothing is said.
-    Raises OutOfDomainError, which says what the nearest lack, when none covers the scene.
+    `conditions`: force field and solvent that they must have been trained under, if any. Raises OutOfDomainError, which
+    says what the nearest lack, when none covers the scene.
     """
     found, refusals, levels = [], [], {}
     for name, path in shipped_weights().items():
@@ -480,16 +415,3 @@ def check_conditions(known: Mapping[str, Any], asked: Mapping[str, Any], name: s
     apart = [f"{key} {known[key]}, not {value}" for key, value in asked.items() if known.get(key) not in (None, value)]
     if apart:
         raise OutOfDomainError(f"{name} was trained under other conditions: {', '.join(apart)}")
-
-
-def weights_to_go_on_from(scene: Scene) -> str | None:
-    """Return the name of shipped weights of peptides that know all residues of a scene, so that a training on MD of it
-    may begin with them, whatever keeps them from covering it; None where none do."""
-    for name, path in shipped_weights().items():
-        header = read_header(path)
-        config = architecture(header.arch).config(header.config)
-        if isinstance(config, PeptideConfig):
-            with suppress(OutOfDomainError):
-                match_known(scene, header.domain, path.name, config, force=True)
-                return name
-    return None

@@ -9,7 +9,6 @@ from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass, field
 from datetime import UTC, datetime
-from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -18,29 +17,18 @@ import numpy.typing as npt
 import torch
 
 from surrogate.models.potential import Potential
-from surrogate.sampling.chunks import ChunkSampler, noise_seed
-from surrogate.sampling.config import GUARDS, RolloutConfig
+from surrogate.sampling.chunks import Chunk, ChunkSampler, Guard, Interventions, Tally, noise_seed, none_through
+from surrogate.sampling.config import RolloutConfig as RolloutConfig
+from surrogate.sampling.coupling import Coupling, EnergyCheck, MemberSpread, ReferenceDifference, RelaxedEnergy
 from surrogate.sampling.domain import DomainMatch, fit_weights, in_bath
-from surrogate.sampling.interventions import Chunk, Clock, Guard, Interventions, Tally, none_through
-from surrogate.sampling.openmm.coupling import Coupling, EnergyCheck, MemberSpread, ReferenceDifference, RelaxedEnergy
 from systems.chemistry.validity import INVALID, Geometry, check_frames
 from systems.errors import InputError, SimulationError, first_line
 from systems.files.outside import UNREADABLE, arrays_in, check_disk
 from systems.files.schema import built
 from systems.interrupts import deferred_interrupt
 from systems.scene import Scene, part_of, select_atoms
+from systems.trajectory import checkpoint
 from systems.trajectory.base import TrajectoryWriter
-from systems.trajectory.checkpoint import (
-    FLUSH_SHARE,
-    Checkpoint,
-    checkpoint_path,
-    locked_outputs,
-    new_header,
-    read_checkpoint,
-    supported_checkpoint,
-    write_checkpoint,
-    writer_at,
-)
 from systems.trajectory.codec import open_trajectory
 from systems.units import format_time_ps, whole_steps
 
@@ -105,22 +93,8 @@ def resolve_plan(
         "start": hashlib.sha256(scene.positions_nm.tobytes()).hexdigest()[:16],
     }
     del settings["time_ps"]  # a rollout may be resumed to become longer
-    for key in ("lag_ps", "compile", "friction_per_ps", "timestep_ps", "ensemble", "anneal_ps"):
-        if settings[key] in (None, False):
-            del settings[key]  # as checkpoints of earlier versions have it
-    return Plan(
-        scene=scene,
-        weights=weights,
-        config=config,
-        match=match,
-        kept_atoms=kept,
-        shift_nm=centre if np.abs(centre).max() <= _FAR_NM else np.zeros(3),
-        save_every_ps=save_every_ps,
-        stride=stride,
-        n_frames=n_frames,
-        n_between=n_between,
-        settings=settings,
-    )
+    shift_nm = centre if np.abs(centre).max() <= _FAR_NM else np.zeros(3)
+    return Plan(scene, weights, config, match, kept, shift_nm, save_every_ps, stride, n_frames, n_between, settings)
 
 
 # Checkpoint of a rollout: written beside its first file after each flush, read by `resume`.
@@ -159,7 +133,7 @@ def packed_progress(progress: Progress) -> tuple[dict[str, Any], bytes]:
     return plain, buffer.getvalue()
 
 
-def progress_of(path: Path, state: Checkpoint, settings: dict[str, Any] | None) -> Progress:
+def progress_of(path: Path, state: checkpoint.Checkpoint, settings: dict[str, Any] | None) -> Progress:
     """Return where a rollout of these settings stood, or of any (None), by one state in its checkpoint `path`.
 
     Raises InputError when it cannot be read, or the rollout was started with other settings.
@@ -182,13 +156,14 @@ def progress_of(path: Path, state: Checkpoint, settings: dict[str, Any] | None) 
 
 # Record of a rollout: settings, provenance and summary in its files, and the lines shown while it runs.
 
-# Options that stand in a part of the record, by its name.
-_SUMMARIES = {"interventions": ("guard", "energy_every", "md_between_ps"), "selection": ("atoms", "select")}
+# Options that stand in a part of the record.
+_OF_INTERVENTIONS, _OF_SELECTION = ("guard", "energy_every", "md_between_ps"), ("atoms", "select")
 
 
 def new_record(plan: Plan, sampler: ChunkSampler, checks: Guard, *, replica: int) -> dict[str, Any]:
-    """Return the record that a replica's file begins with."""
-    config, weights = plan.config, plan.weights
+    """Return the record that a replica's file begins with; how long the run is, its frames say."""
+    options, weights = asdict(plan.config), plan.weights
+    apart = ("time_ps", *_OF_INTERVENTIONS, *_OF_SELECTION)
     record = {
         "kind": "rollout",
         "model": weights.model.arch,
@@ -198,7 +173,7 @@ def new_record(plan: Plan, sampler: ChunkSampler, checks: Guard, *, replica: int
         "started": datetime.now(UTC).isoformat(timespec="seconds"),
         "completed": False,
         "replica": replica,
-        **_asked(config),
+        **{name: value for name, value in options.items() if name not in apart},
         "save_every_ps": plan.save_every_ps,
         "lag_ps": weights.domain.lag_ps,
         "precision": sampler.precision.name,
@@ -213,22 +188,15 @@ def new_record(plan: Plan, sampler: ChunkSampler, checks: Guard, *, replica: int
     if plan.match.deviations:
         record["out_of_domain"] = [deviation.to_dict() for deviation in plan.match.deviations]
     if len(plan.kept_atoms) < plan.scene.n_atoms:
-        record["selection"] = {**_asked(config, "selection"), "of_atoms": plan.scene.n_atoms}
+        record["selection"] = {**{name: options[name] for name in _OF_SELECTION}, "of_atoms": plan.scene.n_atoms}
     if plan.shift_nm.any() != plan.scene.positions_nm.mean(axis=0).any():
         record["moved_nm"] = (-plan.scene.positions_nm.mean(axis=0)).tolist()
     return record
 
 
-def _asked(config: RolloutConfig, summary: str = "") -> dict[str, Any]:
-    """Return the options of one summary of the record, else all that stand in none. How long it is, its frames say."""
-    options = asdict(config)
-    apart = {"time_ps", *chain(*_SUMMARIES.values())}
-    return {name: options[name] for name in _SUMMARIES.get(summary) or (name for name in options if name not in apart)}
-
-
 def _interventions(plan: Plan, tally: Tally, seconds: dict[str, float], checks: Guard) -> dict[str, Any]:
     return {
-        **_asked(plan.config, "interventions"),
+        **{name: getattr(plan.config, name) for name in _OF_INTERVENTIONS},
         **tally.to_record(),
         "seconds": {key: round(value, 3) for key, value in seconds.items()},
         "unchecked": list(checks.unchecked),
@@ -239,11 +207,9 @@ def close_summary(plan: Plan, state: Progress, checks: Guard, sampler: ChunkSamp
                    writers: Sequence[TrajectoryWriter], *, completed: bool) -> None:  # fmt: skip
     """Enter what was done and what it cost, by now or in all."""
     for writer, tally in zip(writers, state.tallies, strict=True):
-        done = {"completed": True} if completed else {}
         summary = _interventions(plan, tally, state.seconds, checks)
-        writer.update_record(
-            {"interventions": summary, "cost": _cost(plan, state, tally, sampler, len(writers)), **done}
-        )
+        cost = _cost(plan, state, tally, sampler, len(writers))
+        writer.update_record({"interventions": summary, "cost": cost, **({"completed": True} if completed else {})})
 
 
 def _cost(plan: Plan, state: Progress, tally: Tally, sampler: ChunkSampler, n_replicas: int) -> dict[str, Any]:
@@ -260,21 +226,14 @@ def _cost(plan: Plan, state: Progress, tally: Tally, sampler: ChunkSampler, n_re
     }
 
 
-@dataclass(frozen=True)
-class Speed:
-    """Speed since this process began: what an interrupted run did before does not count."""
-
-    steps: int
-    since: float
-
-    def describe(self, plan: Plan, state: Progress, n_replicas: int) -> str:
-        """Return '24200 ns/day, 290 frames/s, 3 helped': of all replicas together; chunks that were helped."""
-        elapsed = max(time.monotonic() - self.since, 1e-9)
-        per_s = (state.steps - self.steps) * n_replicas / elapsed
-        helped = sum(tally.chunks_caught for tally in state.tallies)
-        word = "caught" if plan.config.guard in ("off", "flag") else "helped"
-        ns_per_day = per_s * plan.weights.domain.lag_ps * 86.4
-        return f"{ns_per_day:.3g} ns/day, {per_s / plan.stride:.3g} frames/s, {helped} {word}"
+def described_speed(plan: Plan, state: Progress, steps: int, elapsed_s: float) -> str:
+    """Return '24200 ns/day, 290 frames/s, 3 helped', of all replicas together, by the `steps` that this process made
+    of each; chunks that were helped."""
+    per_s = steps * len(state.tallies) / max(elapsed_s, 1e-9)
+    helped = sum(tally.chunks_caught for tally in state.tallies)
+    word = "caught" if plan.config.guard in ("off", "flag") else "helped"
+    ns_per_day = per_s * plan.weights.domain.lag_ps * 86.4
+    return f"{ns_per_day:.3g} ns/day, {per_s / plan.stride:.3g} frames/s, {helped} {word}"
 
 
 def why_stopped(plan: Plan, state: Progress, chunk: Chunk, outs: Sequence[Path]) -> str:
@@ -290,8 +249,6 @@ def why_stopped(plan: Plan, state: Progress, chunk: Chunk, outs: Sequence[Path])
         advice = f"the frames before are in {outs[row]}. Use other weights, or `surromd reference` for this molecule."
     return f"replica {row}, {at}: {reason}; {advice}"
 
-
-__all__ = ["GUARDS", "RolloutConfig", "rollout"]
 
 # Stages of annealing, of which the first are hot: as hot as the states that potentials learn from.
 HOT_K, HOT_STAGES, ANNEAL_STAGES = 600.0, 3, 10
@@ -317,37 +274,29 @@ def rollout(
     """Roll a scene forward, one replica per path in `outs`, all in one batch; return the paths.
 
     Frames stand at save_every_ps, 2 save_every_ps, ... up to time_ps, in the scene's own atom order and pose, each
-    marked with its chunk, its validity flags (systems.chemistry.validity) against the
-    training reference, and what was done about it (column `intervention`, `interventions.MARKS`); the record's
-    `interventions` summaries for them. Replica k draws chunk c's noise from a generator seeded by (seed, k, c), so a
-    replica does not depend on how many run beside it, and a resumed rollout continues as if it had not stopped. Ctrl-C
-    and SIGTERM stop between two chunks, with everything on disk: KeyboardInterrupt. Memory that does not suffice for
-    all replicas at once halves the batch. `announce` is told how the scene leaves what was trained on.
-    Raises OutOfDomainError, InputError, StorageError; SimulationError when the guard cannot bring a chunk through
-    (under 'flag' and 'off' the chunk is in the file, marked; else what came before).
+    marked with its chunk, its validity flags (systems.chemistry.validity) against the training reference, and what was
+    done about it (column `intervention`, `chunks.MARKS`), of which the record holds a summary. Replica k draws
+    chunk c's noise from a generator seeded by (seed, k, c), so a replica does not depend on how many run beside it, and
+    a resumed rollout continues as if it had not stopped. Ctrl-C and SIGTERM stop between two chunks, with everything on
+    disk: KeyboardInterrupt. Memory that does not suffice for all replicas at once halves the batch. `announce` gets
+    lines about how the scene leaves what was trained on. Raises OutOfDomainError, InputError, StorageError;
+    SimulationError when the guard cannot bring a chunk through (under 'flag' and 'off' the chunk is in the file,
+    marked; else what came before).
     """
     weights, match = fit_weights(
-        scene,
-        in_bath(weights, config.bath),
-        temperature_k=config.temperature_k,
-        force=config.force,
-        lag_ps=config.lag_ps,
-        save_every_ps=config.save_every_ps,
-    )
+        scene, in_bath(weights, config.bath), temperature_k=config.temperature_k, force=config.force,
+        lag_ps=config.lag_ps, save_every_ps=config.save_every_ps,
+    )  # fmt: skip
     if announce is not None:
         for line in match.input_notes(weights.path.name):
             announce(line)
-    state_path = checkpoint_path(outs[0])
+    state_path = checkpoint.checkpoint_path(outs[0])
     precision = config.precision
     if resume and precision == "auto" and state_path.exists():
         # A rollout that goes on keeps it, whatever another processor would choose.
-        precision = "bf16" if read_checkpoint(state_path)[0]["settings"]["bf16"] else "fp32"
+        precision = "bf16" if checkpoint.read_checkpoint(state_path)[0]["settings"]["bf16"] else "fp32"
     sampler = ChunkSampler(
-        weights,
-        solver_steps=config.solver_steps,
-        solver=config.solver,
-        precision=precision,
-        compile=config.compile,
+        weights, solver_steps=config.solver_steps, solver=config.solver, precision=precision, compile=config.compile
     )
     plan = resolve_plan(scene, weights, match, config, sampler, n_replicas=len(outs))
     checks = Guard(weights.domain)
@@ -355,15 +304,15 @@ def rollout(
 
     with ExitStack() as stack:
         asked_to_stop = stack.enter_context(deferred_interrupt())
-        stack.enter_context(locked_outputs(outs, may_exist=resume or overwrite))
+        stack.enter_context(checkpoint.locked_outputs(outs, may_exist=resume or overwrite))
         if resume and not state_path.exists() and any(path.exists() for path in outs):
             return _already_complete(outs, plan)
-        kept = supported_checkpoint(state_path, outs) if resume and state_path.exists() else None
+        kept = checkpoint.supported_checkpoint(state_path, outs) if resume and state_path.exists() else None
         if kept is None:
             state = _start(plan, sampler, len(outs), asked_to_stop)
         else:
             state = progress_of(state_path, kept, plan.settings)
-        header = kept[0] if kept else new_header(len(outs), overwrite=overwrite)
+        header = kept[0] if kept else checkpoint.new_header(len(outs), overwrite=overwrite)
         if plan.n_frames < header.get("n_frames_wanted", 0):
             raise InputError(
                 f"{outs[0]} was started for {header['n_frames_wanted']} frames and cannot become shorter; resume with "
@@ -371,7 +320,6 @@ def rollout(
             )
         header |= {"settings": plan.settings, "n_frames_wanted": plan.n_frames}
         sampler.batch, sampler.drawn, sampler.evaluations = state.batch, state.drawn, state.evaluations
-        clock = Clock(state.seconds)
         coupling = None
         if config.needs_openmm:
             coupling = Coupling(weights)
@@ -380,25 +328,31 @@ def rollout(
         energy: EnergyCheck | None = None
         if config.energy_every and coupling is not None:
             energy = ReferenceDifference(coupling, weights) if learned else RelaxedEnergy(coupling)
-        engine = Interventions(sampler, checks, config.guard, config.seed, clock, coupling, config.energy_every,
+        engine = Interventions(sampler, checks, config.guard, config.seed, state.seconds, coupling, config.energy_every,
                                plan.n_between, energy, MemberSpread(weights) if learned else None)  # fmt: skip
 
         def save() -> None:
             header["progress"], arrays = packed_progress(state)
-            write_checkpoint(state_path, header, arrays)
+            checkpoint.write_checkpoint(state_path, header, arrays)
 
         if not state.steps:
             # Before there are files, so that a rollout killed at any later moment can be gone on with.
             save()
-        writers = _open_writers(stack, plan, sampler, checks, outs, header, resumed=kept is not None)
-        buffers: list[list[_Block]] = [[] for _ in outs]
+        part = scene if len(plan.kept_atoms) == scene.n_atoms else part_of(scene, plan.kept_atoms)
+        writers: list[TrajectoryWriter] = []
+        for k, path in enumerate(outs):
+            record = new_record(plan, sampler, checks, replica=k)
+            opened = checkpoint.writer_at(path, part, record, header, k, resumed=kept is not None)
+            writers.append(stack.enter_context(opened))
+        buffers: list[list[Block]] = [[] for _ in outs]
         started = time.monotonic() - state.wall_s
         flushed_at, flushed_s = time.monotonic(), 0.0
-        speed = Speed(state.steps, time.monotonic())
+        # What an interrupted run did before counts as no speed.
+        first_step, began = state.steps, time.monotonic()
 
         def flush() -> None:
             nonlocal flushed_at, flushed_s
-            began = time.monotonic()
+            since = time.monotonic()
             for writer, buffer in zip(writers, buffers, strict=True):
                 _flush(writer, buffer, energy)
             header["files"] = [{"n_frames": writer.n_frames, "digest": writer.digest()} for writer in writers]
@@ -406,7 +360,7 @@ def rollout(
             if state.steps < plan.n_steps:
                 save()
             flushed_at = time.monotonic()
-            flushed_s = flushed_at - began
+            flushed_s = flushed_at - since
 
         while state.steps < plan.n_steps:
             chunk = engine.advance(
@@ -426,12 +380,12 @@ def rollout(
             _buffer(plan, state, chunk, buffers)
             _move_on(state, chunk, sampler)
             complete, stopping = state.steps >= plan.n_steps, asked_to_stop()
-            pause_s = max(flush_every_s, FLUSH_SHARE * flushed_s if flush_every_s else 0.0)
+            pause_s = max(flush_every_s, checkpoint.FLUSH_SHARE * flushed_s if flush_every_s else 0.0)
             if complete or stopping or time.monotonic() - flushed_at > pause_s:
                 flush()
             if progress is not None:
-                done = min(state.steps // plan.stride, plan.n_frames)
-                progress(done, plan.n_frames, speed.describe(plan, state, len(outs)))
+                speed = described_speed(plan, state, state.steps - first_step, time.monotonic() - began)
+                progress(min(state.steps // plan.stride, plan.n_frames), plan.n_frames, speed)
             if stopping and not complete:
                 close_summary(plan, state, checks, sampler, writers, completed=False)
                 raise KeyboardInterrupt
@@ -490,19 +444,11 @@ def _move_on(state: Progress, chunk: Chunk, sampler: ChunkSampler) -> None:
     state.batch, state.drawn, state.evaluations = sampler.batch, sampler.drawn, sampler.evaluations
 
 
-@dataclass(frozen=True, eq=False)
-class _Block:
-    """Frames of one replica, ready to be written."""
-
-    frames: npt.NDArray[np.float32]
-    times: npt.NDArray[np.float64]
-    flags: npt.NDArray[np.uint16]
-    chunk_idx: npt.NDArray[np.int32]
-    marks: npt.NDArray[np.uint8]
-    energies: npt.NDArray[np.float64]
+# Frames of one replica, ready to be written, and what goes with them, by name.
+Block = dict[str, npt.NDArray[Any]]
 
 
-def _buffer(plan: Plan, state: Progress, chunk: Chunk, buffers: list[list[_Block]]) -> None:
+def _buffer(plan: Plan, state: Progress, chunk: Chunk, buffers: list[list[Block]]) -> None:
     """Put by the frames of a chunk that are kept, in the scene's atom order and place."""
     steps = state.steps + 1 + np.arange(chunk.frames_nm.shape[1])
     keep = np.flatnonzero((steps % plan.stride == 0) & (steps <= plan.n_steps))
@@ -510,21 +456,21 @@ def _buffer(plan: Plan, state: Progress, chunk: Chunk, buffers: list[list[_Block
     shift = plan.shift_nm.astype(np.float32)
     for row, buffer in enumerate(buffers):
         buffer.append(
-            _Block(
-                frames=chunk.frames_nm[row, keep][:, atoms].astype(np.float32) + shift,
-                times=(steps[keep] * plan.weights.domain.lag_ps).astype(np.float64),
-                flags=chunk.flags[row, keep],
-                chunk_idx=np.full(len(keep), state.chunks, dtype=np.int32),
-                marks=chunk.marks[row, keep],
-                energies=chunk.energies_kj_mol[row, keep],
-            )
+            {
+                "frames": chunk.frames_nm[row, keep][:, atoms].astype(np.float32) + shift,
+                "times": (steps[keep] * plan.weights.domain.lag_ps).astype(np.float64),
+                "flags": chunk.flags[row, keep],
+                "chunk_idx": np.full(len(keep), state.chunks, dtype=np.int32),
+                "marks": chunk.marks[row, keep],
+                "energies": chunk.energies_kj_mol[row, keep],
+            }
         )
 
 
-def _flush(writer: TrajectoryWriter, buffer: list[_Block], check: EnergyCheck | None) -> None:
+def _flush(writer: TrajectoryWriter, buffer: list[Block], check: EnergyCheck | None) -> None:
     if not buffer:
         return
-    joined = {name: np.concatenate([getattr(b, name) for b in buffer]) for name in vars(buffer[0])}
+    joined = {name: np.concatenate([block[name] for block in buffer]) for name in buffer[0]}
     scalars = {"intervention": joined["marks"]}
     if check is not None:
         scalars[check.column] = joined["energies"]
@@ -532,16 +478,6 @@ def _flush(writer: TrajectoryWriter, buffer: list[_Block], check: EnergyCheck | 
         joined["frames"], joined["times"], flags=joined["flags"], chunk_idx=joined["chunk_idx"], scalars=scalars
     )
     buffer.clear()
-
-
-def _open_writers(stack: ExitStack, plan: Plan, sampler: ChunkSampler, checks: Guard, outs: Sequence[Path],
-                  header: dict[str, Any], *, resumed: bool) -> list[TrajectoryWriter]:  # fmt: skip
-    scene = plan.scene if len(plan.kept_atoms) == plan.scene.n_atoms else part_of(plan.scene, plan.kept_atoms)
-    writers = []
-    for k, path in enumerate(outs):
-        record = new_record(plan, sampler, checks, replica=k)
-        writers.append(stack.enter_context(writer_at(path, scene, record, header, k, resumed=resumed)))
-    return writers
 
 
 def _already_complete(outs: Sequence[Path], plan: Plan) -> list[Path]:

@@ -23,11 +23,10 @@ if TYPE_CHECKING:
     from lightning_fabric import Fabric
 
 
-# fp32 or bf16: which of the two this processor multiplies faster, found by multiplying, once a process.
-# Processors are of two kinds. With AMX or avx512_bf16 products in bf16 take a quarter to a fifteenth of the time,
-# without them (or where ONEDNN_MAX_CPU_ISA forbids them) 1.3 to 7 times as long. No other work on the machine moves one
-# across the limit between, so that a seed keeps its meaning on a machine. And on how many cores it multiplies
-# (`torch_threads`).
+# fp32 or bf16: which of the two this processor multiplies faster, found by multiplying, once a process. With AMX or
+# avx512_bf16 products in bf16 take a quarter to a fifteenth of the time, without them (or where ONEDNN_MAX_CPU_ISA
+# forbids them) 1.3 to 7 times as long. No other work on the machine moves one across the limit between, so that a seed
+# keeps its meaning on a machine.
 
 # By so much products must be faster before the casts about them pay.
 _PAYS = 1.25
@@ -74,26 +73,20 @@ class ProductSpeed:
 
 
 def choose_precision(wanted: str, *, suits: bool = True) -> Precision:
-    """Return the precision for a CPU: as `wanted`, or under 'auto' bf16 where its products are faster.
-
-    `suits`: whether bf16 suits the model at all (`Propagator.float32_layers`). Raises InputError for an unknown name,
-    and for bf16 where it does not.
-    """
+    """Return the precision for a CPU: as `wanted`, or under 'auto' bf16 where its products are faster. `suits`: whether
+    bf16 suits the model at all. Raises InputError for an unknown name, and for bf16 where it does not."""
     if wanted not in ("auto", "fp32", "bf16"):
         raise InputError(f"precision {wanted!r} is unknown; choose auto, fp32 or bf16.")
     if wanted == "bf16" and not suits:
-        raise InputError(
-            "this model integrates its forces or positions, which bf16 would round; leave `precision` out."
-        )
+        raise InputError("this model integrates what bf16 would round, forces or positions; leave `precision` out.")
     if wanted != "auto":
         return Precision(wanted == "bf16", "as asked for")
     if not suits:
         return Precision(False, "this model is exact in fp32 alone")
     speed = product_speed()
     through = f" through {speed.unit}" if speed.unit else ""
-    if speed.ratio >= _PAYS:
-        return Precision(True, f"products in bf16{through} are {speed.ratio:.2g} times as fast as in fp32 here")
-    return Precision(False, f"products in bf16 are {speed.ratio:.2g} times as fast as in fp32 here")
+    reason = f"products in bf16{through} are {speed.ratio:.2g} times as fast as in fp32 here"
+    return Precision(speed.ratio >= _PAYS, reason)
 
 
 def bf16_pays(device_type: str) -> bool:
@@ -144,8 +137,8 @@ def torch_threads(number: int) -> Iterator[None]:
 
 
 class StepThreads:
-    """Has the steps of a loop computed on as many cores as they are fastest on: one, two or four, at most `most`. It
-    is found out by timing, and again from time to time, since other programs come and go."""
+    """Has the steps of a loop computed on as many cores as they are fastest on: one, two or four, at most `most`; timed
+    from time to time, since other programs come and go."""
 
     def __init__(self, most: int) -> None:
         self._numbers = [n for n in (1, 2, 4) if n <= max(most, 1)]
@@ -153,8 +146,7 @@ class StepThreads:
         self._step, self._began = 0, 0.0
 
     def next_step(self) -> int:
-        """Say that a step begins, and return on how many cores. What takes long between steps now and then (a
-        validation) does not count."""
+        """Begin a step, and return on how many cores. A median: a validation between two steps does not count."""
         now, trial = time.perf_counter(), len(self._numbers) * _TIMED_STEPS
         if len(self._numbers) > 1 and 0 < self._step <= trial:
             self._spent_s.setdefault(torch.get_num_threads(), []).append(now - self._began)
@@ -169,9 +161,8 @@ class StepThreads:
         return torch.get_num_threads()
 
 
-# Memory that is freed is kept for the next chunk or training step, where the C library lets a program say so (glibc).
-# It gives arrays of more than some hundred kB back to the kernel as soon as they are freed, and every chunk would have
-# its pages made and zeroed anew: a tenth to a quarter of a rollout's time in a batch, a tenth of a training step's.
+# Memory that is freed is kept for the next chunk or training step, where the C library (glibc) lets a program do so:
+# pages made and zeroed anew take a tenth to a quarter of a rollout's time in a batch, a tenth of a training step's.
 
 # malloc.h: the parameters, and the greatest size that glibc takes for the second.
 _TRIM_THRESHOLD, _MMAP_THRESHOLD = -1, -3
@@ -190,17 +181,14 @@ def keep_freed_memory() -> bool:
     return bool(say(_MMAP_THRESHOLD, _LARGEST_BYTES) and say(_TRIM_THRESHOLD, _KEPT_BYTES))
 
 
-# Devices of a training: one CPU or GPU, or several started by torchrun, by Lightning Fabric.
-# torchrun [...] -m surrogate.cli.main train REF... -o model.safetensors [...]
-# Every process draws its own batch; gradients are averaged, so that the whole batch is the setting's times their
-# number. The first process alone validates and writes.
+# Devices of a training: one CPU or GPU, or several by Lightning Fabric, started by torchrun [...] -m surrogate.cli.main
+# train REF... -o model.safetensors [...]. Every process draws its own batch; gradients are averaged, so that the whole
+# batch is the setting's times their number. The first process alone validates and writes.
 
 
 def choose_device(name: str) -> str:
-    """Return the torch device for 'auto', 'cpu' or 'cuda': of torchrun's processes each its own GPU.
-
-    Raises InputError for one that is unknown or not there.
-    """
+    """Return the torch device for 'auto', 'cpu' or 'cuda': of torchrun's processes each its own GPU. Raises InputError
+    for one that is unknown or not there."""
     if name not in ("auto", "cpu", "cuda"):
         raise InputError(f"the device {name!r} is unknown; choose auto, cpu or cuda.")
     if name == "cuda" and not torch.cuda.is_available():
@@ -231,22 +219,16 @@ def open_fabric(device_type: str, bf16: bool) -> Fabric:
     logging.getLogger("lightning_fabric").setLevel(logging.WARNING)
     n_processes = int(os.environ.get("WORLD_SIZE", "1"))
     here = int(os.environ.get("LOCAL_WORLD_SIZE", str(n_processes)))
-    fabric = Fabric(
-        accelerator=device_type,
-        devices=here,
-        num_nodes=n_processes // here,
-        strategy="ddp" if n_processes > 1 else "auto",
-        precision="bf16-mixed" if bf16 else "32-true",
-    )
+    strategy, precision = "ddp" if n_processes > 1 else "auto", "bf16-mixed" if bf16 else "32-true"
+    fabric = Fabric(accelerator=device_type, devices=here, num_nodes=n_processes // here, strategy=strategy,
+                    precision=precision)  # type: ignore[arg-type]  # fmt: skip
     fabric.launch()
     return fabric
 
 
 def average_gradients(fabric: Fabric, module: nn.Module, spent_s: float) -> float:
-    """Average the gradients over all processes, in place, and return the time that the first one has spent.
-
-    One message of all numbers: these models are small, and their losses do not go through one `forward`.
-    """
+    """Average the gradients over all processes, in place, in one message (these models are small, and their losses do
+    not go through one `forward`), and return the time that the first one has spent."""
     if fabric.world_size == 1:
         return spent_s
     grads = [p.grad for p in module.parameters() if p.grad is not None]

@@ -7,28 +7,18 @@ import hashlib
 import json
 import math
 import re
-import statistics
-import sys
 import time
-from collections import defaultdict, deque
+from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor, nn
 
-from surrogate.training.devices import (
-    average_gradients,
-    bf16_pays,
-    is_first_process,
-    keep_freed_memory,
-    open_fabric,
-    wait_for_all,
-)
+from surrogate.training import devices
 from systems.errors import InputError, SimulationError, first_line
 from systems.files.schema import built, parsed
 from systems.files.whole_file import create_whole
@@ -36,52 +26,6 @@ from systems.interrupts import stop_if_asked
 
 if TYPE_CHECKING:
     from lightning_fabric import Fabric
-
-
-# Early warnings: a training that is about to diverge says so before its loss is no number any more.
-
-# A gradient this many times the usual one, so often in a row, is a warning.
-FACTOR, IN_A_ROW = 10.0, 3
-_USUAL = 200
-
-
-class Watch:
-    """Compares each step's gradient norm (before clipping) with the median of the last 200 ordinary ones."""
-
-    def __init__(self) -> None:
-        self._norms: deque[float] = deque(maxlen=_USUAL)
-        self._high = 0
-        self.n_warnings = 0
-
-    def see(self, step: int, norm: float) -> str | None:
-        """Return a warning, one for each time that the norm stays high, or None."""
-        usual = statistics.median(self._norms) if len(self._norms) >= 20 else math.inf
-        if norm <= FACTOR * usual:
-            self._norms.append(norm)
-            self._high = 0
-            return None
-        self._high += 1
-        if self._high != IN_A_ROW:
-            return None
-        self.n_warnings += 1
-        return (
-            f"at step {step} the gradient is {norm / usual:.0f} times its median for {IN_A_ROW} steps in a row; if "
-            "this goes on the training will diverge: lower the learning rate."
-        )
-
-
-def first_not_finite(module: nn.Module) -> str:
-    """Name the first parameter whose gradient, or else value, holds something that is no number; '' if none does."""
-
-    def broken(tensor: Tensor | None) -> bool:
-        return tensor is not None and not bool(tensor.isfinite().all())
-
-    named = list(module.named_parameters())
-    for found in ([n for n, p in named if broken(p)], [n for n, p in named if broken(p.grad)]):
-        if found:
-            return found[0]
-    return ""
-
 
 # Muon: momentum of matrices, made orthogonal before it is a step (Jordan et al., kellerjordan.github.io/posts/muon).
 # Potentials learn more by it in the same time (docs/studies/quantum/optimisers.py). torch has one of its own from 2.9
@@ -141,9 +85,29 @@ class Muon(torch.optim.Optimizer):
         return momentum
 
 
-# The curves of a training as a picture: NAME.svg beside the CSV that the loop writes.
+# The curves of a training: a CSV that the loop writes, and NAME.svg beside it.
 
 Rows = list[dict[str, str]]
+
+
+def append_row(path: Path, row: dict[str, Any]) -> None:
+    """Append a row to a CSV; columns that it does not have yet are added, empty in the rows before."""
+    columns: list[str] = []
+    rows: list[dict[str, Any]] = []
+    if path.exists():
+        with path.open(newline="") as handle:
+            reader = csv.DictReader(handle)
+            columns, rows = list(reader.fieldnames or ()), list(reader)
+    columns += [k for k in row if k not in columns]
+    rows.append({k: f"{v:.6g}" if isinstance(v, float) else v for k, v in row.items()})
+
+    def fill(temporary: Path) -> None:
+        with temporary.open("w", newline="") as handle:
+            writer = csv.DictWriter(handle, columns, restval="")
+            writer.writeheader()
+            writer.writerows(rows)
+
+    create_whole(path, fill)
 
 
 def read_curves(path: Path) -> dict[str, Rows]:
@@ -181,7 +145,8 @@ def plot_curves(path: Path) -> Path:
     return out
 
 
-# The checksum that files of tensors state: what the disk or a copy has changed is noticed when they are read.
+# Files of tensors: safetensors with a record (JSON) and a checksum of both, so that what the disk or a copy has changed
+# is noticed when they are read.
 
 
 def tensor_checksum(text: str, tensors: Mapping[str, torch.Tensor]) -> str:
@@ -191,6 +156,36 @@ def tensor_checksum(text: str, tensors: Mapping[str, torch.Tensor]) -> str:
         found.update(f"{name} {tensor.dtype} {tuple(tensor.shape)}".encode())
         found.update(tensor.contiguous().numpy().tobytes())
     return found.hexdigest()
+
+
+def save_tensors(path: Path, kind: str, record: dict[str, Any], tensors: Mapping[str, Tensor], **more: str) -> None:
+    """Write tensors with their record, which stands in the metadata under the name `kind`, whole or not at all."""
+    from safetensors.torch import save_file
+
+    kept = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
+    text = json.dumps(record)
+    metadata = {**more, kind: text, "sha256": tensor_checksum(text, kept)}
+    create_whole(path, lambda temporary: save_file(kept, temporary, metadata=metadata))
+
+
+def load_tensors(path: Path, kind: str) -> tuple[dict[str, Any], dict[str, Tensor]]:
+    """Return record and tensors as they were saved. Raises InputError for a file that is damaged or another's."""
+    from safetensors import SafetensorError, safe_open
+
+    try:
+        with safe_open(path, framework="pt") as handle:
+            metadata = handle.metadata()
+            tensors = {key: handle.get_tensor(key) for key in handle.keys()}  # noqa: SIM118
+        record = parsed(metadata[kind])
+        whole = metadata.keys() == {kind, "sha256"} and metadata["sha256"] == tensor_checksum(metadata[kind], tensors)
+    except (SafetensorError, OSError, ValueError, KeyError, TypeError) as error:
+        raise InputError(f"{path} cannot be read ({first_line(error)}); train again without `resume`.") from error
+    if not whole:
+        raise InputError(
+            f"{path} is damaged: it is not what was written (checksum); restore it from a whole copy, or train again "
+            "without `resume`."
+        )
+    return record, tensors
 
 
 # One optimisation loop for every stage: budget in time or steps, warm-up and cosine, EMA, clipping, exact resume.
@@ -296,20 +291,17 @@ def run_stage(
     *,
     progress: ProgressFn | None = None,
     on_save: Callable[[float], None] | None = None,
-    warn: Callable[[str], None] | None = None,
 ) -> float:
     """Train `module` in place and leave it holding its EMA weights; return the seconds of training spent.
 
     `loss_fn(generator)` draws its own batch from the generator, so that a resumed run draws what an uninterrupted one
     would have. Each validation logs a CSV row, saves the resume state and calls `on_save(spent_s)` with EMA weights in.
     Of several processes (training.devices) each draws its own batches, and the first alone validates and writes.
-    `warn` hears of a gradient that has outgrown all others (stderr if None). Raises SimulationError when the loss stops
-    being finite; the last saved state stays.
+    Raises SimulationError when the loss stops being finite; the last saved state stays.
     """
-    keep_freed_memory()
+    devices.keep_freed_memory()
     device = place.device
-    fabric = open_fabric(device.type, config.bf16 and bf16_pays(device.type))
-    watch = Watch()
+    fabric = devices.open_fabric(device.type, config.bf16 and devices.bf16_pays(device.type))
     optimisers = optimisers_of(module, config)
     rates = [[group["lr"] for group in optimiser.param_groups] for optimiser in optimisers]
     ema = Ema(module, config.ema_decay)
@@ -335,17 +327,13 @@ def run_stage(
         loss.backward()
         now = time.monotonic()
         # The first process's clock decides for all when to validate and to end.
-        spent_s, last = average_gradients(fabric, module, spent_s + now - last), now
+        spent_s, last = devices.average_gradients(fabric, module, spent_s + now - last), now
         norm = nn.utils.clip_grad_norm_(module.parameters(), config.clip_norm)
         if not torch.isfinite(norm):
-            where = first_not_finite(module)
             raise SimulationError(
-                f"training stage {config.name!r}: loss or gradient is not finite at step {step}"
-                f"{f', first in {where}' if where else ''}; lower the learning rate (now {config.learning_rate:g}). "
-                f"The last good state is {place.state}."
+                f"training stage {config.name!r}: loss or gradient is not finite at step {step}; lower the learning "
+                f"rate (now {config.learning_rate:g}). The last good state is {place.state}."
             )
-        if (warning := watch.see(step, float(norm))) and fabric.is_global_zero:
-            (warn or _to_stderr)(f"training stage {config.name!r}: {warning}")
         for optimiser in optimisers:
             optimiser.step()
         ema.update(module, step)
@@ -366,8 +354,7 @@ def run_stage(
                     on_save(spent_s)
             sums, n_summed = {}, 0
             append_row(place.log, {"stage": config.name, "step": step, "spent_s": round(spent_s, 1),
-                                  "learning_rate": config.learning_rate * factor, **metrics,
-                                  "warnings": watch.n_warnings})  # fmt: skip
+                                  "learning_rate": config.learning_rate * factor, **metrics})  # fmt: skip
             save_state(place.state, module, ema, optimisers, generators, step, spent_s, config)
             if progress is not None:
                 progress(config.name, config.share_done(step, spent_s), metrics)
@@ -403,34 +390,41 @@ def train_stages(
     """Train stage after stage and write the weights `out`; beside them stand a CSV of the curves and, until all is
     done, the state of each stage (NAME.STAGE.train.safetensors), from which `resume` goes on.
 
-    The next stage is asked for when one has ended, so that a generator may prepare it from what that has learned, and
-    do what is left to do after the last. `write(spent_s)` writes the weights, given the seconds of training of each
-    stage so far. Of several processes the first alone writes. Raises SimulationError when a loss stops being finite.
+    The next stage is asked for when one has ended: a generator may prepare it from what that has learned, and do what
+    is left to do after the last. `write(spent_s)` writes the weights, given the seconds of training of each stage so
+    far; of several processes the first alone calls it. Raises SimulationError when a loss stops being finite.
     """
     log, spent_s = out.with_suffix(".csv"), list[float]()
     own = re.compile(re.escape(out.stem) + r"\.[^.]+\.train\.safetensors")
 
     def forget(*more: Path) -> None:
-        if is_first_process():
+        if devices.is_first_process():
             for path in (*more, *(path for path in out.parent.iterdir() if own.fullmatch(path.name))):
                 path.unlink(missing_ok=True)
 
     if not resume:
         forget(log)
     for stage in stages:
-        save = partial(_write_with, write, list(spent_s)) if stage.saves else None
+
+        def save(now_s: float) -> None:
+            write([*spent_s, now_s])
+
         place = StagePlace(out.with_name(f"{out.stem}.{stage.config.name}.train.safetensors"), log, device, resume)
         spent_s.append(
-            run_stage(stage.module, stage.config, stage.loss, stage.validate, place, progress=progress, on_save=save)
+            run_stage(
+                stage.module,
+                stage.config,
+                stage.loss,
+                stage.validate,
+                place,
+                progress=progress,
+                on_save=save if stage.saves else None,
+            )
         )
-    if is_first_process():
+    if devices.is_first_process():
         write(spent_s)
     forget()
-    wait_for_all()
-
-
-def _write_with(write: Callable[[list[float]], None], before_s: list[float], spent_s: float) -> None:
-    write([*before_s, spent_s])
+    devices.wait_for_all()
 
 
 def optimisers_of(module: nn.Module, config: StageConfig) -> list[torch.optim.Optimizer]:
@@ -455,10 +449,6 @@ def optimisers_of(module: nn.Module, config: StageConfig) -> list[torch.optim.Op
     return [adam, Muon(matrices, config.matrix_rate, config.weight_decay)]
 
 
-def _to_stderr(line: str) -> None:
-    sys.stderr.write(f"warning: {line}\n")
-
-
 def _all_generators(fabric: Fabric, generator: torch.Generator, device: torch.device) -> Tensor:
     """Return the states of all processes' generators: `(n,)` of a single one, else `(processes, n)`."""
     state = generator.get_state()
@@ -467,32 +457,6 @@ def _all_generators(fabric: Fabric, generator: torch.Generator, device: torch.de
     gathered = fabric.all_gather(state.to(device))
     assert isinstance(gathered, Tensor)
     return gathered.cpu()
-
-
-def append_row(path: Path, row: dict[str, Any]) -> None:
-    """Append a row to a CSV; columns that it does not have yet are added, empty in the rows before."""
-    written = {k: f"{v:.6g}" if isinstance(v, float) else v for k, v in row.items()}
-    columns: list[str] = []
-    if path.exists():
-        with path.open(newline="") as handle:
-            columns = next(csv.reader(handle), [])
-    if set(row) <= set(columns):
-        with path.open("a", newline="") as handle:
-            csv.DictWriter(handle, columns, restval="").writerow(written)
-        return
-    rows: list[dict[str, Any]] = []
-    if columns:
-        with path.open(newline="") as handle:
-            rows = list(csv.DictReader(handle))
-    columns += [k for k in row if k not in columns]
-
-    def fill(temporary: Path) -> None:
-        with temporary.open("w", newline="") as handle:
-            writer = csv.DictWriter(handle, columns, restval="")
-            writer.writeheader()
-            writer.writerows([*rows, written])
-
-    create_whole(path, fill)
 
 
 @dataclass(frozen=True)
@@ -514,18 +478,15 @@ def _prefix(number: int) -> str:
 
 def save_state(path: Path, module: nn.Module, ema: Ema, optimisers: list[torch.optim.Optimizer], generators: Tensor,
                step: int, spent_s: float, config: StageConfig) -> None:  # fmt: skip
-    """Write the training state (safetensors, JSON in its metadata) whole or not at all."""
-    from safetensors.torch import save_file
-
-    tensors = {f"model.{k}": v.detach().cpu().contiguous() for k, v in module.state_dict().items()}
-    tensors |= {f"ema.{k}": v.cpu().contiguous() for k, v in ema.shadow.items()}
+    """Write the training state whole or not at all."""
+    tensors = {f"model.{k}": v for k, v in module.state_dict().items()}
+    tensors |= {f"ema.{k}": v for k, v in ema.shadow.items()}
     for number, optimiser in enumerate(optimisers):
         for index, state in optimiser.state_dict()["state"].items():
-            tensors |= {f"{_prefix(number)}{index}.{k}": v.detach().cpu().contiguous() for k, v in state.items()}
-    tensors["generator"] = generators.contiguous()
-    text = json.dumps(asdict(StateHeader(step, spent_s, config.name, config.seed, config.batch, config.matrix_rate)))
-    metadata = {"surromd_training": text, "sha256": tensor_checksum(text, tensors)}
-    create_whole(path, lambda temporary: save_file(tensors, temporary, metadata=metadata))
+            tensors |= {f"{_prefix(number)}{index}.{k}": v for k, v in state.items()}
+    tensors["generator"] = generators
+    header = StateHeader(step, spent_s, config.name, config.seed, config.batch, config.matrix_rate)
+    save_tensors(path, "surromd_training", asdict(header), tensors)
 
 
 def load_state(path: Path, module: nn.Module, ema: Ema, optimisers: list[torch.optim.Optimizer],
@@ -535,23 +496,8 @@ def load_state(path: Path, module: nn.Module, ema: Ema, optimisers: list[torch.o
 
     Raises InputError when the state is damaged, of another run or of another number of processes.
     """
-    from safetensors import SafetensorError, safe_open
-
-    try:
-        with safe_open(path, framework="pt") as handle:
-            metadata = handle.metadata()
-            header = built(StateHeader, parsed(metadata["surromd_training"]))
-            tensors = {key: handle.get_tensor(key) for key in handle.keys()}  # noqa: SIM118
-    except (SafetensorError, OSError, ValueError, KeyError, TypeError) as error:
-        raise InputError(f"training state {path} cannot be read ({error}); train again without `resume`.") from error
-    # States of earlier versions carry no checksum; a name that is neither is one that was altered.
-    if set(metadata) - {"surromd_training", "sha256"} or (
-        "sha256" in metadata and metadata["sha256"] != tensor_checksum(metadata["surromd_training"], tensors)
-    ):
-        raise InputError(
-            f"training state {path} is damaged: it is not what was written (checksum); restore it from a whole copy, "
-            "or train again without `resume`."
-        )
+    record, tensors = load_tensors(path, "surromd_training")
+    header = built(StateHeader, record)
     for key, expected in (("stage", config.name), ("seed", config.seed), ("batch", config.batch),
                           ("matrix_rate", config.matrix_rate)):  # fmt: skip
         if getattr(header, key) != expected:
@@ -572,8 +518,7 @@ def load_state(path: Path, module: nn.Module, ema: Ema, optimisers: list[torch.o
             index, name = key.split(".", 1)
             state.setdefault(int(index), {})[name] = tensor
         optimiser.load_state_dict({"state": state, "param_groups": optimiser.state_dict()["param_groups"]})
-    states = tensors["generator"]
-    states = states[None] if states.ndim == 1 else states
+    states = torch.atleast_2d(tensors["generator"])
     if len(states) != process[1]:
         raise InputError(f"training state {path} is of {len(states)} processes, this run has {process[1]}.")
     generator.set_state(states[process[0]])

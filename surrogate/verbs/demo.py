@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from surrogate.data.shipped import weights_path
+from surrogate.models.architecture import weights_path
 from surrogate.verbs.compare import compare
 from surrogate.verbs.options import DemoOptions, PathLike
 from surrogate.verbs.reference import reference

@@ -6,7 +6,7 @@ import math
 from pathlib import Path
 from typing import Any
 
-from surrogate.data.shipped import shipped_weights
+from surrogate.models.architecture import shipped_weights
 from surrogate.verbs.campaign import describe_campaign
 from surrogate.verbs.options import PathLike
 from systems.errors import InputError, OutOfDomainError, first_line
@@ -84,7 +84,7 @@ def describe_file(path: Path) -> dict[str, Any]:
         raise InputError(f"{path}: no such file.")
     if path.suffix.lower() == ".safetensors":
         return _weights(path)
-    from surrogate.data.frames import is_windows
+    from surrogate.data import is_windows
 
     if path.suffix.lower() in (".h5", ".hdf5") and is_windows(path):
         return _windows(path)
@@ -177,7 +177,7 @@ def intervention_lines(record: dict[str, Any]) -> list[str]:
 
 
 def _windows(path: Path) -> dict[str, Any]:
-    from surrogate.data.frames import load_frames
+    from surrogate.data import load_frames
 
     frames = load_frames(path)
     return {

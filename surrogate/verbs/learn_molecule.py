@@ -53,8 +53,8 @@ def learn_molecule(
     scene = prepare_scene(given, Preparation(), quiet=options.quiet)
 
     from md_reference.run.labeller import Labeller
-    from surrogate.models.painet.potential.model import PainetPotential
-    from surrogate.models.painet.potential.trainer import PotentialTrainer
+    from surrogate.models.painet.energy import PainetPotential
+    from surrogate.models.painet.potential_trainer import PotentialTrainer
     from surrogate.verbs.train_verdict import trial_s
 
     trainer: PotentialTrainer = architecture(POTENTIAL).trainer()

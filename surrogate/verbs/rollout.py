@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from surrogate.data.shipped import weights_path
+from surrogate.models.architecture import weights_path
 from surrogate.progress import progress_bar
 from surrogate.sampling.config import RolloutConfig
 from surrogate.verbs.messages import tell

@@ -8,8 +8,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from surrogate.data.shipped import weights_path
-from surrogate.models.architecture import architecture, names
+from surrogate.models.architecture import architecture, names, weights_path
 from surrogate.progress import progress_bar
 from surrogate.verbs.learn_molecule import learn_molecule
 from surrogate.verbs.messages import tell
@@ -20,7 +19,7 @@ from systems.files.whole_file import OutputLock
 from systems.options import options_as_keywords
 
 if TYPE_CHECKING:
-    from surrogate.data.references import References
+    from surrogate.data import References
     from surrogate.models.architecture import Choice, Trainer, TrainingRequest
 
 
@@ -172,7 +171,7 @@ def _device(name: str) -> str:
 def _plan(references: Trajectories, validation: Trajectories | None, asked: TrainingRequest, *,
           explained: bool = False) -> _Plan:  # fmt: skip
     """Find the references and choose what is not asked for."""
-    from surrogate.data.references import References
+    from surrogate.data import References
 
     if asked.arch:
         _check_start(asked)

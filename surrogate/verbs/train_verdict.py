@@ -180,7 +180,7 @@ def _roll(weights: Weights) -> _Rolled:
 def _count(found: _Rolled, path: Path, domain: TrainingDomain) -> None:
     import numpy as np
 
-    from surrogate.sampling.interventions import caught
+    from surrogate.sampling.chunks import caught
     from systems.chemistry.validity import flag_names
     from systems.trajectory.codec import open_trajectory
 
@@ -223,7 +223,7 @@ def _advice(weights: Weights, stages: dict[str, list[dict[str, str]]], rolled: _
 
 def _nearer_weights(weights: Weights) -> list[str]:
     """Name shipped weights that know this molecule, or molecules like it, under the same conditions."""
-    from surrogate.data.shipped import shipped_weights
+    from surrogate.models.architecture import shipped_weights
     from surrogate.models.weights import read_header
     from surrogate.sampling.domain import find_deviations
 

@@ -18,7 +18,7 @@ def windows(references: Trajectories, out: PathLike, options: WindowsOptions) ->
     is. `velocities` keeps these as well, for PAINET, and leaves frames in their own pose. Raises InputError when
     scenes, save intervals or conditions differ, TrajectoryError for damaged files.
     """
-    from surrogate.data.frames import load_frames, write_windows
+    from surrogate.data import load_frames, write_windows
 
     out = Path(out)
     check_outputs([out], [".h5"], overwrite=options.overwrite)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from surrogate.data.frames import TrainingFrames
+from surrogate.data import TrainingFrames
 from surrogate.models.baselines import (
     BaselineConfig,
     ConstantVelocity,
@@ -148,7 +148,7 @@ def test_resampled_and_markov_frames_are_training_frames(tmp_path: Path, harmoni
 
 def test_a_markov_state_model_has_the_populations_and_the_rate_of_its_reference(alanine_dipeptide: Scene) -> None:
     """Two structures, hopping with probability 0.05 and 0.15 per frame: three quarters of the time in the first."""
-    from surrogate.data.frames import canonicalise, quantise
+    from surrogate.data import canonicalise, quantise
     from surrogate.models.baselines import fit_markov_state_model
 
     rng = np.random.default_rng(3)

@@ -9,8 +9,7 @@ import torch
 from torch import Tensor
 
 from surrogate.models.conformance import PropagatorContract, branched_chain, random_state
-from surrogate.models.lam_slide.model import LamSlide
-from surrogate.models.lam_slide.network import ApproximatorConfig, AutoencoderConfig, LamSlideConfig
+from surrogate.models.lam_slide.model import ApproximatorConfig, AutoencoderConfig, LamSlide, LamSlideConfig
 from surrogate.models.propagator import Chunk, Molecule, Propagator
 from surrogate.models.weights import Weights, load_weights, save_weights
 from surrogate.sampling.runner import RolloutConfig, rollout

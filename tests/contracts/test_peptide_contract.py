@@ -10,9 +10,9 @@ import torch
 from torch import Tensor
 
 from surrogate.models.conformance import PropagatorContract
+from surrogate.models.peptides.chains import MOST_TORSIONS, conditioning_states
 from surrogate.models.peptides.layout import PeptideConfig, chain_layout, chain_scale
 from surrogate.models.peptides.model import PeptideSlide
-from surrogate.models.peptides.torsion_states import MOST_TORSIONS, conditioning_states
 from surrogate.models.propagator import Molecule, Propagator
 from systems.errors import InputError
 from systems.prepare.peptide import build_peptide

@@ -13,10 +13,15 @@ from torch import Tensor
 
 from known_answers import pair_energy
 from surrogate.models.conformance import PotentialContract, branched_chain
-from surrogate.models.painet.potential import energy as room
-from surrogate.models.painet.potential import model as simd
-from surrogate.models.painet.potential.energy import PotentialConfig, bonded_shells, find_edges, latent_energy
-from surrogate.models.painet.potential.model import PainetPotential, simd_potential_of
+from surrogate.models.painet import energy as room
+from surrogate.models.painet.energy import (
+    PainetPotential,
+    PotentialConfig,
+    bonded_shells,
+    find_edges,
+    latent_energy,
+    simd_potential_of,
+)
 from surrogate.models.potential import RigidBonds
 from surrogate.models.propagator import Molecule, Propagator
 from systems.errors import InputError
@@ -128,7 +133,7 @@ def test_steps_by_simd_are_those_of_torch(timestep_ps: float, rows: int, monkeyp
 
     found = moved(lively(config))
     with monkeypatch.context() as without:
-        without.setattr("surrogate.models.painet.potential.model.simd_potential_of", lambda *_, **__: None)
+        without.setattr("surrogate.models.painet.energy.simd_potential_of", lambda *_, **__: None)
         expected = moved(lively(config))
     for one, other in zip(found, expected, strict=True):
         torch.testing.assert_close(one, other, rtol=0, atol=1e-4 * float((other - other.mean(0)).abs().max()))
@@ -165,7 +170,7 @@ def test_simd_is_for_single_precision_few_atoms_and_a_model_at_rest(monkeypatch:
     assert by_simd(lively(), 9)
     assert not by_simd(lively().double(), 9) and not by_simd(lively(), 80)
     monkeypatch.setenv("PATH", "")
-    simd._program.cache_clear()
+    room._program.cache_clear()
     assert not by_simd(lively(), 9), "without a compiler"
 
 

@@ -17,8 +17,8 @@ import torch
 
 from rollout_child import CHUNKS_UNTIL_STOPPED, FAILED, INTERRUPTED, start, until_stopped, within_file_size
 from surrogate.models.weights import Weights, load_weights
-from surrogate.sampling.openmm.simulation import Simulation
 from surrogate.sampling.runner import Progress, RolloutConfig, packed_progress, progress_of, rollout
+from surrogate.sampling.simulation import Simulation
 from systems.errors import InputError, StorageError, SurromdError, TrajectoryError, WeightsError
 from systems.scene import Scene
 from systems.trajectory.checkpoint import checkpoint_path, read_checkpoint

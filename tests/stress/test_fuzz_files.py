@@ -13,9 +13,9 @@ import numpy as np
 import pytest
 
 from surrogate.models.weights import Weights, load_weights
-from surrogate.sampling.interventions import Tally
-from surrogate.sampling.openmm.simulation import Simulation
+from surrogate.sampling.chunks import Tally
 from surrogate.sampling.runner import Progress, packed_progress, progress_of
+from surrogate.sampling.simulation import Simulation
 from systems.errors import SurromdError
 from systems.scene import Scene
 from systems.trajectory.checkpoint import new_header, read_checkpoint, write_checkpoint

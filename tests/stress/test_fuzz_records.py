@@ -24,7 +24,7 @@ from md_reference.run.platforms import PlatformChoice
 from md_reference.run.simulate import MDConfig, simulate
 from surrogate import api
 from surrogate.cli.render import print_pairs
-from surrogate.data.frames import TrainingFrames, collect_frames, load_frames
+from surrogate.data import TrainingFrames, collect_frames, load_frames
 from surrogate.models.weights import Weights, load_weights
 from surrogate.sampling.runner import RolloutConfig, rollout
 from surrogate.training.loop import tensor_checksum

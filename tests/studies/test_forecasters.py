@@ -19,14 +19,14 @@ from forecasters import (
     measure_cost,
     window_errors,
 )
+from painet_modes import ModalConfig, ModalEgnn, ModalPainet
 
-from surrogate.data.frames import TrainingFrames, quantise
-from surrogate.models.painet.model import EgnnForecaster, Painet, PainetConfig
-from surrogate.models.painet.trainer import PainetTraining
+from surrogate.data import TrainingFrames, quantise
+from surrogate.models.painet.model import PainetTraining
 from systems.errors import InputError
 from systems.scene import Scene
 
-SMALL = PainetConfig(n_new=2, width=16, n_heads=2, head_dim=8, n_decoder_layers=1, lag_ps=0.01)
+SMALL = ModalConfig(n_new=2, width=16, n_heads=2, head_dim=8, n_decoder_layers=1, lag_ps=0.01)
 
 
 @pytest.fixture(scope="module")
@@ -60,9 +60,9 @@ def test_a_chunk_costs_processor_time_in_both_forms() -> None:
 
 def test_egnn_is_given_at_least_the_parameters_and_hardly_more() -> None:
     width = matched_width(SMALL)
-    target = _working_parameters(Painet(SMALL))
+    target = _working_parameters(ModalPainet(SMALL))
     assert width > SMALL.width
-    assert target <= _working_parameters(EgnnForecaster(replace(SMALL, width=width))) < 1.2 * target
+    assert target <= _working_parameters(ModalEgnn(replace(SMALL, width=width))) < 1.2 * target
 
 
 def test_the_unseen_part_is_the_last_and_nothing_else(drifting: TrainingFrames) -> None:
@@ -74,7 +74,7 @@ def test_the_unseen_part_is_the_last_and_nothing_else(drifting: TrainingFrames) 
 
 def test_the_error_is_per_coordinate_in_square_angstrom(drifting: TrainingFrames) -> None:
     """A model that keeps everything in place is wrong by v t: its mean square follows from the velocities."""
-    model = Painet(SMALL)
+    model = ModalPainet(SMALL)
     with torch.no_grad():
         for name, p in model.decoder.named_parameters():
             if "factor.2" in name:

@@ -10,7 +10,7 @@ import torch
 from integrator import IntegratorReport, angles, bonds, compare_integrator
 from torch import Tensor
 
-from surrogate.data.frames import TrainingFrames, quantise
+from surrogate.data import TrainingFrames, quantise
 from surrogate.models.baselines import Baseline, BaselineConfig
 from surrogate.models.propagator import Chunk, Molecule
 from systems.scene import Scene

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from one_chunk import ChunkError, State, chunk_errors, leapfrog
 
-from surrogate.data.frames import QUANTUM_NM, TrainingFrames, quantise
+from surrogate.data import QUANTUM_NM, TrainingFrames, quantise
 from systems.errors import InputError
 from systems.scene import Scene
 

@@ -19,8 +19,8 @@ import torsion_profiles
 import torsion_states
 
 from surrogate.comparison.equivalent_time import EquivalentTime
-from surrogate.data.shipped import weights_path
-from surrogate.models.painet.potential.trainer import Samples
+from surrogate.models.architecture import weights_path
+from surrogate.models.painet.potential_trainer import Samples
 from surrogate.models.propagator import Molecule
 from surrogate.models.weights import Weights, load_weights, save_weights
 from systems.prepare.molecule import scene_from_smiles

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from surrogate.data.references import References
+from surrogate.data import References
 from surrogate.models.architecture import AdvanceFn, Architecture, Prepared, Settings, Trainer, TrainingRequest, build
 from surrogate.models.propagator import Chunk, Molecule, Propagator
 from surrogate.models.weights import provenance_of, save_weights, training_domain

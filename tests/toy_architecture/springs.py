@@ -9,7 +9,7 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor
 
-from surrogate.data.references import References
+from surrogate.data import References
 from surrogate.models.architecture import AdvanceFn, Architecture, Prepared, Settings, Trainer, TrainingRequest, build
 from surrogate.models.potential import IntegratorConfig, Potential
 from surrogate.models.propagator import Molecule

@@ -18,8 +18,8 @@ import sys
 for name in {blocked}:
     sys.modules[name] = None  # importing it now raises ImportError
 import numpy as np
-from surrogate.data.frames import TrainingFrames, load_frames
-from surrogate.models.lam_slide.network import LamSlideConfig
+from surrogate.data import TrainingFrames, load_frames
+from surrogate.models.lam_slide.model import LamSlideConfig
 from surrogate.models.lam_slide.trainer import TrainingConfig, train_lam_slide
 frames = load_frames({windows!r})
 config = LamSlideConfig.from_dict({config!r})

@@ -19,7 +19,6 @@ COMMON_NAMES = {"__init__", "architecture", "config", "model", "base", "choices"
 
 # May only become shorter: a line goes when what it names is mended.
 MANY_PARAMETERS = {
-    "surrogate/models/painet/trainer.py:train_painet": "the trainers' common signature",
     "surrogate/sampling/runner.py:rollout": "callbacks beside the settings",
 }
 

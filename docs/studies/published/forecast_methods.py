@@ -21,8 +21,7 @@ if TYPE_CHECKING:
     import torch
     from forecaster_training import Training
 
-    from surrogate.models.lam_slide.model import LamSlide
-    from surrogate.models.lam_slide.network import AutoencoderConfig
+    from surrogate.models.lam_slide.model import AutoencoderConfig, LamSlide
     from surrogate.training.loop import ProgressFn
 
 Array = npt.NDArray[np.float64]
@@ -217,8 +216,7 @@ def latent_forecaster(
 
     `plain_flow`: as in the paper, uniform flow times of weight one and no preconditioning.
     """
-    from surrogate.models.lam_slide.model import LamSlide
-    from surrogate.models.lam_slide.network import ApproximatorConfig, LamSlideConfig
+    from surrogate.models.lam_slide.model import ApproximatorConfig, LamSlide, LamSlideConfig
 
     return LamSlide(
         LamSlideConfig(

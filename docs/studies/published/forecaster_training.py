@@ -14,7 +14,6 @@ from torch import Tensor
 
 from surrogate.models.lam_slide.model import LamSlide
 from surrogate.models.lam_slide.trainer import (
-    FlowWindows,
     autoencoder_loss,
     draw_flow_times,
     flow_loss,
@@ -265,15 +264,15 @@ def train_lam_slide_on_windows(
         with torch.no_grad(), torch.autocast(device.type, enabled=False):
             latents = encode_windows(model, x, kinds)
         tau = draw_flow_times(model, two.batch, generator).to(device)
-        return flow_loss(model, FlowWindows(latents, x.shape[2]), tau, generator)
+        return flow_loss(model, latents, x.shape[2], tau, generator)
 
     @torch.no_grad()
     def flow() -> dict[str, float]:
         generator, losses = torch.Generator().manual_seed(0), []
         for x, kinds in held:
             tau = draw_flow_times(model, len(x), generator).to(device)
-            windows = FlowWindows(encode_windows(model, x, kinds), x.shape[2])
-            losses.append(flow_loss(model, windows, tau, generator)[1]["flow"])
+            windows = encode_windows(model, x, kinds)
+            losses.append(flow_loss(model, windows, x.shape[2], tau, generator)[1]["flow"])
         return {"validation_flow": float(torch.stack(losses).mean())}
 
     return spent + run_training(model.approximator, two, stage_two, flow, training)

@@ -9,9 +9,9 @@ processor time of one thread, and prints the exponent of a power law fitted to a
 trajectories with velocities, for the same number of steps or the same time, and prints the mean square error over all
 predicted frames (A-MSE) on the last fifth of each trajectory, which neither has seen, beside the frozen frame's and
 constant velocity's. `--modes` and `--free-rotation` (which EGNN gets as well) are what this project adds to the paper's
-PAINET; `--attention none` leaves its attention out. `--frames 1 --stride 300` is state-to-state at 1.5 ps of 5 fs
-frames, `--frames 8 --stride 37` state-to-trajectory. With `-o FOLDER` finished trainings stay and interrupted ones go
-on.
+PAINET (`painet_modes`); `--attention none` leaves its attention out. `--frames 1 --stride 300` is state-to-state at
+1.5 ps of 5 fs frames, `--frames 8 --stride 37` state-to-trajectory. With `-o FOLDER` finished trainings stay and
+interrupted ones go on.
 
 `python docs/studies/published/reproduce.py md17` leaves trajectories of the eight molecules that serve here.
 """
@@ -32,12 +32,13 @@ import numpy.typing as npt
 import torch
 from forecast_errors import Estimate, block_means, ratio
 from integrator import cut
+from painet_modes import ModalConfig, ModalEgnn, ModalPainet
+from safetensors.torch import load_file
 
-from surrogate.data.frames import TrainingFrames, collect_frames
+from surrogate.data import TrainingFrames, collect_frames
 from surrogate.models.conformance import branched_chain, random_state
-from surrogate.models.painet.model import EgnnForecaster, Painet, PainetConfig
-from surrogate.models.painet.trainer import PainetTraining, StateWindows, for_frames, train_painet
-from surrogate.models.weights import load_weights
+from surrogate.models.painet.model import Painet, PainetConfig, PainetTraining, StateWindows, for_frames, train_painet
+from surrogate.models.weights import read_header
 from systems.errors import InputError
 
 SIZES = (10, 30, 100, 300, 1000, 3000, 10_000)
@@ -97,11 +98,11 @@ class Errors:
     painet_s: float
 
 
-def matched_width(config: PainetConfig) -> int:
+def matched_width(config: ModalConfig) -> int:
     """Return the width at which EGNN has at least PAINET's parameters, those of elements that do not occur aside."""
-    target = _working_parameters(Painet(config))
+    target = _working_parameters(ModalPainet(config))
     width = config.width
-    while _working_parameters(EgnnForecaster(replace(config, width=width))) < target:
+    while _working_parameters(ModalEgnn(replace(config, width=width))) < target:
         width += 2
     return width
 
@@ -112,7 +113,7 @@ def _working_parameters(model: Painet) -> int:
 
 
 def compare_errors(
-    path: Path, config: PainetConfig, training: PainetTraining, folder: Path, windows_at_most: int = 500
+    path: Path, config: ModalConfig, training: PainetTraining, folder: Path, windows_at_most: int = 500
 ) -> Errors:
     """Train both on the first four fifths of a trajectory and compare them on the last; what `folder` holds of them
     under the trajectory's name is gone on with."""
@@ -120,17 +121,17 @@ def compare_errors(
     known, unseen = cut(whole, TEST_SHARE)
     wide = replace(config, width=matched_width(config))
     found, sizes, spent = {}, {}, {}
-    for kind, settings in ((Painet, config), (EgnnForecaster, wide)):
+    for kind, settings in ((ModalPainet, config), (ModalEgnn, wide)):
         out = folder / f"{path.stem}.{kind.arch}.safetensors"
         if not out.exists() or any(folder.glob(f"{out.stem}.*.train.safetensors")):
             train_painet(known, out, settings, training, model_class=kind, resume=True)
-        weights = load_weights(out)
-        if weights.model.config != kind(for_frames(settings, known)).config:
+        model, header = kind(for_frames(settings, known)), read_header(out)
+        if model.config.to_dict() != header.config:
             raise InputError(f"{out} is of other settings; name another folder.")
-        spent[kind.arch] = float(weights.provenance["training_s"])
-        assert isinstance(weights.model, Painet)
-        found[kind.arch] = window_errors(weights.model, unseen, windows_at_most)
-        sizes[kind.arch] = _working_parameters(weights.model)
+        model.load_state_dict(load_file(out))
+        spent[kind.arch] = float(header.provenance["training_s"])
+        found[kind.arch] = window_errors(model.eval(), unseen, windows_at_most)
+        sizes[kind.arch] = _working_parameters(model)
     windows = StateWindows(unseen, config, torch.device("cpu"))
     starts = thinned(windows.starts, windows_at_most)
     blocks = np.minimum(starts // windows.span, max(0, unseen.n_frames // windows.span - 1))
@@ -190,8 +191,8 @@ def run_cost(args: argparse.Namespace) -> list[Cost]:
 
 
 def run_error(args: argparse.Namespace) -> list[Errors]:
-    config = PainetConfig(n_new=args.frames, frame_stride=args.stride, width=args.width, attention=args.attention,
-                          n_modes=args.modes, free_rotation=args.free_rotation)  # fmt: skip
+    config = ModalConfig(n_new=args.frames, frame_stride=args.stride, width=args.width, attention=args.attention,
+                         n_modes=args.modes, free_rotation=args.free_rotation)  # fmt: skip
     training = PainetTraining(steps=args.steps, budget_s=args.seconds, batch=args.batch, noise=0.0, pushforward=0.0,
                               velocity_weight=0.0, seed=args.seed, device=args.device)  # fmt: skip
     rows = []

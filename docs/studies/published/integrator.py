@@ -22,7 +22,7 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
-from surrogate.data.frames import TrainingFrames, collect_frames
+from surrogate.data import TrainingFrames, collect_frames
 from surrogate.models.painet.model import Painet
 from surrogate.models.propagator import Molecule, Propagator
 from surrogate.models.weights import load_weights

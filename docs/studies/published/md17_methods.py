@@ -213,7 +213,7 @@ def lam_slide_particles(molecules: Sequence[MoleculeWindows], settings: Settings
 
 def lam_slide_model(settings: Settings, *, large: bool) -> LamSlide:
     """Return the model: Table 11's sizes where there is a GPU for them, else one of four latents in one token."""
-    from surrogate.models.lam_slide.network import AutoencoderConfig
+    from surrogate.models.lam_slide.model import AutoencoderConfig
 
     autoencoder = AutoencoderConfig(n_latents=32 if large else 4, latent_dim=32, n_octaves=3, type_weight=0.01)
     if large:

@@ -34,10 +34,8 @@ from torch import Tensor, nn
 
 from md_reference.run.machine import machine_name
 from surrogate.models.lam_slide import flow
-from surrogate.models.lam_slide.model import LamSlide
-from surrogate.models.lam_slide.network import Decoded, LamSlideConfig
+from surrogate.models.lam_slide.model import Decoded, LamSlide, LamSlideConfig
 from surrogate.models.lam_slide.trainer import (
-    FlowWindows,
     autoencoder_loss,
     draw_flow_times,
     flow_loss,
@@ -201,7 +199,7 @@ def _of_a_set(
         with torch.no_grad(), torch.autocast("cpu", enabled=False):
             latents = encode_windows(model, x, kinds)
         tau = torch.zeros(change.batch) if change.mean_only else draw_flow_times(model, change.batch, generator)
-        return flow_loss(model, FlowWindows(latents, x.shape[2]), tau, generator)
+        return flow_loss(model, latents, x.shape[2], tau, generator)
 
     @torch.no_grad()
     def forecast(data: ParticleSet, n_samples: int, solver_steps: int) -> Array:

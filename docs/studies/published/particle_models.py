@@ -12,7 +12,7 @@ from itertools import pairwise
 import torch
 from torch import Tensor, nn
 
-from surrogate.models.painet.decoders import NOT_BONDED, Egnn, Graph
+from surrogate.models.painet.model import NOT_BONDED, Egnn, Graph
 
 # Kinds of pairs that pair forces know.
 N_PAIR_KINDS = 2

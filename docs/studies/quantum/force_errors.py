@@ -18,7 +18,7 @@ from four_molecules import force_error, frames_of
 
 import surrogate as sm
 from md_reference.run.labeller import Labeller
-from surrogate.data.shipped import weights_path
+from surrogate.models.architecture import weights_path
 from surrogate.models.propagator import Molecule
 from surrogate.models.weights import load_weights
 

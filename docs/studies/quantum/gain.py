@@ -26,7 +26,7 @@ import surrogate as sm
 from md_reference.run.machine import machine_name
 from surrogate.comparison.comparison import Evaluation
 from surrogate.comparison.equivalent_time import EquivalentTime
-from surrogate.data.shipped import weights_path
+from surrogate.models.architecture import weights_path
 from surrogate.models.weights import load_weights
 from systems.scene import Scene
 from systems.trajectory.codec import open_trajectory

@@ -19,9 +19,8 @@ from typing import Any
 import torch
 
 from md_reference.run.machine import machine_name
-from surrogate.models.painet.potential.energy import PotentialConfig
-from surrogate.models.painet.potential.model import PainetPotential
-from surrogate.models.painet.potential.trainer import Learner, PotentialTraining, samples_path
+from surrogate.models.painet.energy import PainetPotential, PotentialConfig
+from surrogate.models.painet.potential_trainer import Learner, PotentialTraining, samples_path
 from surrogate.models.weights import load_weights
 from surrogate.training.loop import StageConfig, StagePlace, run_stage
 from systems.units import parse_wall_s

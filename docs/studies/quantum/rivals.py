@@ -27,8 +27,8 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from md_reference.run.machine import machine_name
-from surrogate.models.painet.decoders import Egnn, molecular_graph
-from surrogate.models.painet.potential.trainer import Samples, samples_path
+from surrogate.models.painet.model import Egnn, molecular_graph
+from surrogate.models.painet.potential_trainer import Samples, samples_path
 from surrogate.models.potential import gradient_of
 from surrogate.models.propagator import Molecule
 from surrogate.models.weights import load_weights

@@ -21,7 +21,7 @@ from md_reference.forces.spec import QUANTUM, ForceFieldSpec
 from md_reference.run.config import Conditions
 from md_reference.run.engine import Engine
 from md_reference.run.machine import machine_name
-from surrogate.data.shipped import weights_path
+from surrogate.models.architecture import weights_path
 from surrogate.models.propagator import Molecule
 from surrogate.models.weights import load_weights
 from systems.chemistry.graph import bonded_graph, rotatable_torsions, turned

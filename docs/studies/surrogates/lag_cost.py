@@ -26,7 +26,7 @@ from surrogate.bench.held_out import refuse_trained_on
 from surrogate.bench.machine import machine_facts
 from surrogate.bench.rolling import Roller
 from surrogate.comparison.measure.distributions import RAMACHANDRAN_BINS, distance, is_positive
-from surrogate.data.shipped import weights_path
+from surrogate.models.architecture import weights_path
 from surrogate.models.weights import load_weights
 from surrogate.sampling.chunks import ChunkSampler
 from surrogate.sampling.domain import fit_weights

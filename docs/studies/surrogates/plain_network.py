@@ -11,7 +11,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from surrogate.models.lam_slide import flow
-from surrogate.models.lam_slide.network import Approximator, LatentLayer
+from surrogate.models.lam_slide.model import Approximator, LatentLayer
 from surrogate.models.layers import ParallelBlock
 
 

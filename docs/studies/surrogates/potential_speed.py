@@ -17,8 +17,7 @@ from functools import partial
 import torch
 
 from md_reference.forces.quantum import Potential
-from surrogate.models.painet.potential.energy import PotentialConfig
-from surrogate.models.painet.potential.model import PainetPotential
+from surrogate.models.painet.energy import PainetPotential, PotentialConfig
 from surrogate.models.potential import gradient_of
 from surrogate.models.propagator import Molecule
 from systems.prepare.molecule import scene_from_smiles

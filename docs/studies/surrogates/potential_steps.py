@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from surrogate.data.shipped import weights_path
+from surrogate.models.architecture import weights_path
 from surrogate.models.propagator import Molecule
 from surrogate.models.weights import Weights, load_weights
 from surrogate.sampling.runner import RolloutConfig, rollout

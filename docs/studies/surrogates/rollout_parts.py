@@ -19,12 +19,11 @@ import numpy as np
 import torch
 
 from surrogate.bench.machine import machine_facts
-from surrogate.data.shipped import weights_path
+from surrogate.models.architecture import weights_path
 from surrogate.models.lam_slide.model import LamSlide
 from surrogate.models.propagator import draw_noise
 from surrogate.models.weights import load_weights
-from surrogate.sampling.chunks import ChunkSampler
-from surrogate.sampling.interventions import Guard
+from surrogate.sampling.chunks import ChunkSampler, Guard
 from systems.chemistry.geometry import superposition
 from systems.trajectory.codec import open_writer
 

@@ -29,11 +29,10 @@ from torch import Tensor
 from torch.utils.flop_counter import FlopCounterMode
 
 from surrogate.bench.machine import machine_facts
-from surrogate.data.shipped import weights_path
+from surrogate.models.architecture import weights_path
 from surrogate.models.lam_slide import flow
-from surrogate.models.lam_slide.model import LamSlide
-from surrogate.models.lam_slide.network import Approximator, ApproximatorConfig
-from surrogate.models.lam_slide.trainer import FlowWindows, draw_flow_times, flow_loss
+from surrogate.models.lam_slide.model import Approximator, ApproximatorConfig, LamSlide
+from surrogate.models.lam_slide.trainer import draw_flow_times, flow_loss
 from surrogate.models.propagator import Molecule, draw_noise
 from surrogate.models.weights import load_weights
 from surrogate.sampling.chunks import with_bf16_weights
@@ -104,9 +103,7 @@ def training_rate(model: LamSlide, n_atoms: int, precision: str, peak: float, ba
 
     def step() -> None:
         with torch.autocast("cpu", dtype=torch.bfloat16, enabled=precision == "bf16"):
-            loss, _ = flow_loss(
-                model, FlowWindows(latents, n_atoms), draw_flow_times(model, batch, generator), generator
-            )
+            loss, _ = flow_loss(model, latents, n_atoms, draw_flow_times(model, batch, generator), generator)
         optimiser.zero_grad(set_to_none=True)
         loss.backward()
         optimiser.step()

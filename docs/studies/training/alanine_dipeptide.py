@@ -26,12 +26,14 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from processes import is_trained
+
 from surrogate import api
-from surrogate.data.frames import TrainingFrames, collect_frames
-from surrogate.models.lam_slide.network import ApproximatorConfig, AutoencoderConfig, LamSlideConfig
-from surrogate.models.lam_slide.trainer import TrainingConfig, is_trained, train_lam_slide
+from surrogate.data import TrainingFrames, collect_frames
+from surrogate.models.lam_slide.model import ApproximatorConfig, AutoencoderConfig, LamSlideConfig
+from surrogate.models.lam_slide.trainer import TrainingConfig, train_lam_slide
 from surrogate.models.weights import load_weights, save_weights
-from surrogate.progress import training_bar
+from surrogate.progress import progress_bar
 from systems.files.whole_file import replica_paths
 from systems.units import parse_wall_s
 
@@ -71,8 +73,9 @@ def train(folder: Path, budget_s: float) -> Path:
     out = folder / "model.safetensors"
     if not is_trained(out):
         config = TrainingConfig(budget_s=budget_s, time_reversal=True)
-        with training_bar("alanine dipeptide") as report:
-            train_lam_slide(training_frames(folder), out, MODEL, config, resume=True, progress=report)
+        with progress_bar("alanine dipeptide", quiet=False) as advance:
+            train_lam_slide(training_frames(folder), out, MODEL, config, resume=True,
+                            progress=lambda stage, share, _: advance(round(1000 * share), 1000, stage))  # fmt: skip
     return out
 
 

@@ -26,7 +26,7 @@ from systems.chemistry.validity import INVALID, Geometry, check_frames
 from systems.units import parse_wall_s
 
 if TYPE_CHECKING:
-    from surrogate.data.frames import TrainingFrames
+    from surrogate.data import TrainingFrames
     from surrogate.models.weights import Weights
     from systems.scene import Scene
 
@@ -56,9 +56,11 @@ class Row:
 
 def train(references: Sequence[Path], out: Path, *, longest_lag_ps: float, budget_s: float, compile_: bool) -> None:
     """Train one model for all lags; what is there stays, what was interrupted goes on."""
-    from surrogate.data.frames import collect_frames
-    from surrogate.models.lam_slide.network import ApproximatorConfig, LamSlideConfig
-    from surrogate.models.lam_slide.trainer import TrainingConfig, is_trained, train_lam_slide
+    from processes import is_trained
+
+    from surrogate.data import collect_frames
+    from surrogate.models.lam_slide.model import ApproximatorConfig, LamSlideConfig
+    from surrogate.models.lam_slide.trainer import TrainingConfig, train_lam_slide
 
     if is_trained(out):
         return
@@ -143,7 +145,7 @@ def table(rows: Sequence[Row]) -> str:
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Parse, train, measure, print the table and keep it in FOLDER."""
-    from surrogate.data.frames import collect_frames
+    from surrogate.data import collect_frames
     from surrogate.models.weights import load_weights
 
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)

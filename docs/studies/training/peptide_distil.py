@@ -16,15 +16,13 @@ import torch
 from peptide_subset import training_sets
 from torch import Tensor
 
-from surrogate.data.frames import TrainingFrames
-from surrogate.data.references import FrameSets
+from surrogate.data import FrameSets, TrainingFrames
 from surrogate.models.lam_slide import flow
 from surrogate.models.lam_slide.trainer import pick
-from surrogate.models.peptides.chains import ChainFeatures
+from surrogate.models.peptides.chains import ChainFeatures, conditioning_states
 from surrogate.models.peptides.layout import chain_features
 from surrogate.models.peptides.model import PeptideFlow, PeptideSlide
 from surrogate.models.peptides.subjects import PeptideSubject
-from surrogate.models.peptides.torsion_states import conditioning_states
 from surrogate.models.peptides.trainer import PeptideTraining, by_kind, disturbed
 from surrogate.models.weights import Weights, load_weights, provenance_of, save_weights
 from surrogate.training.loop import Stage, StageConfig, train_stages

@@ -25,7 +25,7 @@ from peptide_list import RESIDUES
 from md_reference.forces.forcefield import build_system
 from md_reference.forces.spec import ForceFieldSpec
 from md_reference.simd.force_field import SimdReplicas
-from surrogate.models.peptides.torsion_states import POSITIVE_PHI_DEG
+from surrogate.models.peptides.chains import POSITIVE_PHI_DEG
 from systems.chemistry.geometry import torsion
 from systems.chemistry.graph import backbone_torsions
 from systems.prepare.peptide import build_peptide

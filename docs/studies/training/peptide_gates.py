@@ -57,7 +57,7 @@ from systems.chemistry.validity import Geometry
 from systems.units import GAS_CONSTANT_KJ_MOL_K
 
 if TYPE_CHECKING:
-    from surrogate.data.frames import TrainingFrames
+    from surrogate.data import TrainingFrames
     from surrogate.models.weights import Weights
 
 FloatArray = npt.NDArray[np.float64]
@@ -73,8 +73,9 @@ def train(
     positive_phi_kt: dict[str, float] | None = None,
 ) -> None:  # fmt: skip
     """Train on one peptide's references; what is there stays, what was interrupted goes on."""
-    from surrogate.data.frames import collect_frames
-    from surrogate.models.lam_slide.trainer import is_trained
+    from processes import is_trained
+
+    from surrogate.data import collect_frames
     from surrogate.models.peptides.layout import PeptideConfig
     from surrogate.models.peptides.trainer import PeptideTraining, train_peptides
 
@@ -126,7 +127,7 @@ def chapman_kolmogorov(weights: Weights, test: TrainingFrames, n_starts: int) ->
 
 def lag_gate(a: argparse.Namespace) -> None:
     """Train on one peptide, measure each lag and Chapman and Kolmogorov's test, print and keep the table."""
-    from surrogate.data.frames import collect_frames
+    from surrogate.data import collect_frames
     from surrogate.models.weights import load_weights
 
     name = "lag-plain" if a.plain else "lag"
@@ -182,7 +183,7 @@ def code_gate(a: argparse.Namespace) -> None:
     """Code and rebuild frames of every test molecule, print and keep what is lost."""
     from peptide_scores import rebuilt
 
-    from surrogate.data.frames import collect_frames
+    from surrogate.data import collect_frames
     from surrogate.models.peptides.layout import PeptideConfig
     from surrogate.models.peptides.trainer import with_scale
 

@@ -38,8 +38,8 @@ def train_on_pairs(
     fewer of a kind have runs.
     """
     from peptide_subset import has_frames, training_sets
+    from processes import is_trained
 
-    from surrogate.models.lam_slide.trainer import is_trained
     from surrogate.models.peptides.layout import PeptideConfig
     from surrogate.models.peptides.trainer import PeptideTraining, train_peptides
     from surrogate.models.weights import load_weights

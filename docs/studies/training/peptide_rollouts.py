@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
-from surrogate.models.peptides.torsion_states import POSITIVE_PHI_DEG
+from surrogate.models.peptides.chains import POSITIVE_PHI_DEG
 from systems.errors import InputError
 
 if TYPE_CHECKING:

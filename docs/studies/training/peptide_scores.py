@@ -21,7 +21,7 @@ import numpy.typing as npt
 
 from surrogate.comparison.measure.distributions import distance
 from surrogate.comparison.measure.torsions import find_torsions
-from surrogate.models.peptides.torsion_states import NEGATIVE_CORE_DEG, POSITIVE_CORE_DEG, POSITIVE_PHI_DEG
+from surrogate.models.peptides.chains import NEGATIVE_CORE_DEG, POSITIVE_CORE_DEG, POSITIVE_PHI_DEG
 from systems.chemistry.geometry import superpose, torsion
 from systems.chemistry.graph import backbone_torsions
 from systems.scene import Scene

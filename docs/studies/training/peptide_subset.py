@@ -26,9 +26,9 @@ import numpy as np
 import numpy.typing as npt
 import torch
 from peptide_list import training_peptides
+from processes import is_trained
 
-from surrogate.data.frames import Split, TrainingFrames, collect_frames, load_frames
-from surrogate.models.lam_slide.trainer import is_trained
+from surrogate.data import Split, TrainingFrames, collect_frames, load_frames
 from surrogate.models.peptides.layout import PeptideConfig, chain_features
 from surrogate.models.peptides.model import PeptideSlide
 from surrogate.models.peptides.subjects import PeptideSubject, balanced_starts

@@ -64,3 +64,8 @@ def only_here(folder: Path) -> Iterator[bool]:
             yield False
             return
         yield True
+
+
+def is_trained(out: Path) -> bool:
+    """Return whether weights `out` are there and no state of an interrupted training is beside them."""
+    return out.exists() and not list(out.parent.glob(f"{out.stem}.*.train.safetensors"))

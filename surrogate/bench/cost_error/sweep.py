@@ -65,7 +65,7 @@ def cost_error(
     report: ReportFn = lambda line: None,
 ) -> dict[str, Any]:
     """Measure weights, by name or file, at the settings of `choose_settings`; see `run_cost_error`."""
-    from surrogate.data.shipped import weights_path
+    from surrogate.models.architecture import weights_path
     from surrogate.models.weights import load_weights
 
     loaded = [load_weights(weights_path(name)) for name in weights]

@@ -14,8 +14,8 @@ import torch
 
 from surrogate.bench.rolling import Roller
 from surrogate.bench.stress.frame_statistics import measure_bonds, measure_validity
-from surrogate.data.frames import fitted_atoms
-from surrogate.models.lean import with_compiled_parts
+from surrogate.data import fitted_atoms
+from surrogate.models.layers import with_compiled_parts
 from surrogate.models.propagator import Propagator, draw_noise
 from surrogate.sampling.chunks import ChunkSampler, noise_seed, with_bf16_weights
 from systems.chemistry.validity import Geometry

@@ -79,7 +79,7 @@ def stress_weights(
     trained on. Raises SurromdError for weights that cannot be loaded or do not cover the scene and a folder that
     cannot be written; KeyboardInterrupt says what is kept.
     """
-    from surrogate.data.shipped import weights_path
+    from surrogate.models.architecture import weights_path
     from surrogate.models.weights import load_weights
     from surrogate.sampling.domain import fit_weights
 
@@ -201,7 +201,7 @@ def _one_length(weights: Weights, folder: Path, config: StressConfig, n_frames: 
 
 def _energy_drift(weights: Weights, replicas: list[Frames]) -> dict[str, Any]:
     """Mean energies of relaxed frames in kJ/mol, first and last tenth, with standard errors; empty without OpenMM."""
-    from surrogate.sampling.openmm.coupling import Coupling
+    from surrogate.sampling.coupling import Coupling
 
     try:
         coupling = Coupling(weights)

@@ -74,11 +74,10 @@ def multistep(predict: DataPrediction, noise: Tensor, n_steps: int, interpolant:
 
     Second order at one evaluation a step: between two grid points the prediction is the line through the last two, for
     which dx/dtau = (o1 - x) / (1 - tau) is integrated exactly (the idea of DPM-Solver++ 2M, Lu 2022, in tau). The grid
-    1 - tau = cos^2(pi k / 2 n) is fine at both ends: near the noise it is decided which state a chunk goes to (coarse
-    steps there make psi of alanine dipeptide hop too often), near the data how wide narrow directions are (bonds).
+    1 - tau = cos^2(pi k / 2 n) is fine at both ends: near the noise it is decided which state a chunk goes to, near the
+    data how wide narrow directions are (bonds).
     """
-    if interpolant != "linear":
-        raise ValueError(f"the multistep solver integrates the linear interpolant, not {interpolant!r}")
+    _linear_only(interpolant)
     o = noise
     grid = [1.0 - level for level in _noise_levels(n_steps)]
     before: tuple[float, Tensor] | None = None
@@ -97,22 +96,18 @@ def multistep(predict: DataPrediction, noise: Tensor, n_steps: int, interpolant:
 def fitted(predict: DataPrediction, noise: Tensor, n_steps: int, interpolant: str) -> Tensor:
     """Integrate the linear interpolant in very few steps: 2 to 10 evaluations, one a step.
 
-    Between two grid points the prediction is a constant, that of the step's start and `fitted_share` of its change
-    since the grid point before: so much that the step is exact for Gaussian data (exponential fitting: Lyche, Numer.
-    Math. 19, 65, 1972) of a width a little below the ratio of noise to signal there, which is what the step decides
-    about. The grid is that of `multistep`. Second order; from about 10 steps on `multistep` is the better.
+    Between two grid points of `multistep` the prediction is a constant, that of the step's start and `fitted_share` of
+    its change since the grid point before: so much that the step is exact for Gaussian data (exponential fitting:
+    Lyche, Numer. Math. 19, 65, 1972) of a width a little below the ratio of noise to signal there. Second order; from
+    about 10 steps on `multistep` is the better.
     """
-    return _exponential(
-        predict, noise, n_steps, interpolant, lambda left: (1.0 - FITTED_BELOW / n_steps) * left / (1.0 - left)
-    )
+    below = 1.0 - FITTED_BELOW / n_steps
+    return _exponential(predict, noise, n_steps, interpolant, lambda left: below * left / (1.0 - left))
 
 
 def gaussian(predict: DataPrediction, noise: Tensor, n_steps: int, interpolant: str) -> Tensor:
-    """`fitted` to one width, that of numbers of unit variance: exact where these are Gaussian at any number of steps.
-
-    For models whose every number is an innovation of unit variance (`models.peptides`), bonds and angles included,
-    which `multistep` leaves too wide.
-    """
+    """`fitted` to one width, that of numbers of unit variance: exact where these are Gaussian at any number of steps,
+    as innovations of peptides nearly are."""
     return _exponential(predict, noise, n_steps, interpolant, lambda left: 1.0)
 
 
@@ -121,14 +116,10 @@ def angular(predict: DataPrediction, noise: Tensor, n_steps: int, interpolant: s
     evaluation a step.
 
     Over its width for data of unit variance, o moves with the angle by F: by how much the prediction differs from the
-    best linear one, in units of that one's error (`preconditioning`; TrigFlow, Lu and Song 2024, arXiv:2410.11081). Of
-    Gaussian numbers of unit variance F is nothing, so that they are exact in a single step already; of others F is
-    extrapolated from the step before (Adams and Bashforth).
+    best linear one, in units of that one's error (`preconditioning`; TrigFlow, Lu and Song 2024, arXiv:2410.11081). It
+    is zero for Gaussian numbers of unit variance, and else extrapolated from the step before (Adams and Bashforth).
     """
-    if interpolant != "linear":
-        raise ValueError(f"the angular solver integrates the linear interpolant, not {interpolant!r}")
-    if n_steps < 1:
-        raise ValueError(f"n_steps must be at least 1, not {n_steps}")
+    _linear_only(interpolant)
     step = 0.5 * math.pi / n_steps
     u, before = noise, None
     for k in range(n_steps):
@@ -145,19 +136,21 @@ def angular(predict: DataPrediction, noise: Tensor, n_steps: int, interpolant: s
 def _exponential(
     predict: DataPrediction, noise: Tensor, n_steps: int, interpolant: str, width_at: Callable[[float], float]
 ) -> Tensor:
-    if interpolant != "linear":
-        raise ValueError(f"the fitted solver integrates the linear interpolant, not {interpolant!r}")
+    _linear_only(interpolant)
     o = noise
     levels = _noise_levels(n_steps)
     before: Tensor | None = None
     for k, (left, right) in enumerate(pairwise(levels)):
-        prediction = predict(o, torch.full((1,), 1.0 - left, device=o.device, dtype=torch.float32))
-        ahead = prediction
+        ahead = prediction = predict(o, torch.full((1,), 1.0 - left, device=o.device, dtype=torch.float32))
         if before is not None:
-            width = width_at(left)
-            ahead = prediction + fitted_share(levels[k - 1], left, right, width) * (prediction - before)
+            ahead = prediction + fitted_share(levels[k - 1], left, right, width_at(left)) * (prediction - before)
         o, before = ahead + (right / left) * (o - ahead), prediction
     return o
+
+
+def _linear_only(interpolant: str) -> None:
+    if interpolant != "linear":
+        raise ValueError(f"this solver integrates the linear interpolant, not {interpolant!r}")
 
 
 def _noise_levels(n_steps: int) -> list[float]:

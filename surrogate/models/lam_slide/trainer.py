@@ -13,27 +13,16 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from surrogate.data.frames import TrainingFrames
-from surrogate.data.references import References, StrideSampler, Survey, strides_up_to
-from surrogate.models.architecture import (
-    AdvanceFn,
-    Architecture,
-    Choice,
-    Prepared,
-    Settings,
-    Suitability,
-    Trainer,
-    TrainingRequest,
-)
+from surrogate.data import References, StrideSampler, Survey, TrainingFrames, strides_up_to
+from surrogate.models import architecture as arch
 from surrogate.models.lam_slide import flow
-from surrogate.models.lam_slide.model import LamSlide
-from surrogate.models.lam_slide.network import (
+from surrogate.models.lam_slide.model import (
     AutoencoderConfig,
+    LamSlide,
     LamSlideConfig,
     draw_identifiers,
     reconstruction_losses,
 )
-from surrogate.models.propagator import Molecule
 from surrogate.models.weights import Weights, load_weights, provenance_of, read_header, save_weights, training_domain
 from surrogate.training.devices import bf16_pays
 from surrogate.training.loop import ProgressFn, Stage, StageConfig, train_stages
@@ -91,36 +80,24 @@ def draw_flow_times(model: LamSlide, batch: int, generator: torch.Generator) -> 
     return torch.sigmoid(draws).clamp(max=TAU_MAX)
 
 
-@dataclass(frozen=True, eq=False)
-class FlowWindows:
-    """A batch of windows of one molecule as stage two sees them: clean `latents (b, T, L, dim)` of `n_atoms` atoms.
-
-    `lag`: see `LamSlide.embedded_lag`.
-    """
-
-    latents: Tensor
-    n_atoms: int
-    lag: Tensor | None = None
-
-
 def flow_loss(
-    model: LamSlide, windows: FlowWindows, tau: Tensor, generator: torch.Generator
+    model: LamSlide, latents: Tensor, n_atoms: int, tau: Tensor, generator: torch.Generator, lag: Tensor | None = None
 ) -> tuple[Tensor, dict[str, Tensor]]:
-    """Return stage two's loss at flow times `tau (b,)`, and its terms: eq. 9 on the predicted frames (with
-    `loss_on_given` on all), plus decoded position and distance.
+    """Return stage two's loss on windows' clean `latents` (b, T, L, dim) at flow times `tau (b,)`, and its terms: eq. 9
+    on the predicted frames (with `loss_on_given` on all), plus decoded position and distance. `lag`: see
+    `LamSlide.embedded_lag`.
 
     With preconditioning the error is divided by c_out^2, so that every flow time asks for the same relative precision;
     without it the weight is one, as in the paper. The decoded terms compare with the decoded clean latents, so that the
     decoder's own error is not charged to the approximator.
     """
     c = model.config.approximator
-    latents = windows.latents
     known = latents[:, : c.n_conditioning]
     noise = torch.randn(latents.shape, generator=generator).to(latents.device)
     alpha, sigma, _, _ = (flow.expand(v, latents) for v in flow.coefficients(tau, c.interpolant))
     noisy = alpha * latents + sigma * noise
     first = 0 if c.loss_on_given else c.n_conditioning
-    prediction = model.approximator(noisy, tau, known, lag=windows.lag)[:, first:]
+    prediction = model.approximator(noisy, tau, known, lag=lag)[:, first:]
     target = latents[:, first:]
     weight = torch.ones_like(tau)
     if c.precondition:
@@ -130,12 +107,12 @@ def flow_loss(
     if c.auxiliary_frames and (c.position_weight or c.distance_weight):
         pick = torch.randint(target.shape[1], (c.auxiliary_frames,), generator=generator)
         scale = model.config.position_scale_nm
-        decoded = model.decode(prediction[:, pick], windows.n_atoms) / scale
+        decoded = model.decode(prediction[:, pick], n_atoms) / scale
         with torch.no_grad():
-            clean = model.decode(target[:, pick], windows.n_atoms) / scale
+            clean = model.decode(target[:, pick], n_atoms) / scale
         w = weight.reshape(-1, 1, 1, 1).sqrt()
         position = ((decoded - clean) * w).square().sum(-1).mean()
-        i, j = torch.triu_indices(windows.n_atoms, windows.n_atoms, 1)
+        i, j = torch.triu_indices(n_atoms, n_atoms, 1)
         span = lambda x: ((x[..., i, :] - x[..., j, :]).square().sum(-1) + 1e-12).sqrt()  # noqa: E731
         distance = ((span(decoded) - span(clean)) * w[..., 0]).square().mean()
         loss = loss + c.position_weight * position + c.distance_weight * distance
@@ -143,69 +120,69 @@ def flow_loss(
     return loss, terms
 
 
-# Dataset of one molecule for LaM-SLidE's two stages: its frames, windows of them, their latents, input features.
+# The two stages on one molecule.
 
-_HELD_FRAMES = 2048
+_HELD_FRAMES, _HELD_WINDOWS = 2048, 256
 _BLOCK = 8192
+_MEASURED_FRAMES = 20_000
 
 
 @dataclass(eq=False)
 class Subject:
-    """Frames of one molecule and its input features. `latents` (n_frames, n_latents, dim): those of all
-    frames, once stage one is over, where poses stay and memory suffices."""
+    """One molecule's frames and the model that learns them; windows are drawn with any of `strides`. `latents`
+    (n_frames, n_latents, dim): those of all frames, once stage one is over, where poses stay and memory suffices."""
 
     frames: TrainingFrames
-    molecule: Molecule
+    model: LamSlide
+    strides: tuple[int, ...]
     latents: Tensor | None = None
 
-    @staticmethod
-    def of(frames: TrainingFrames, model: LamSlide) -> Subject:
-        return Subject(frames, model.featurise(frames.scene).to(model.latent_mean.device))
+    def __post_init__(self) -> None:
+        self.device = self.model.latent_mean.device
+        self.elements = self.model.featurise(self.frames.scene).elements.to(self.device)
 
-    @property
-    def n_atoms(self) -> int:
-        return self.molecule.n_atoms
-
-    def poses(self, model: LamSlide, rows: int, generator: torch.Generator) -> Tensor | None:
-        """Return a rotation `(rows, 3, 3)` for each window, uniform; None where poses stay as they are."""
-        return None if model.config.canonical else random_rotations(rows, generator)
-
-    def seen(self, x: Tensor, turns: Tensor | None) -> Tensor:
-        """Return frames `(b, ..., n_atoms, 3)` turned, on the model's device."""
-        if turns is not None:
-            x = torch.einsum("bij,b...nj->b...ni", turns, x)
-        return x.to(self.molecule.elements.device)
+    def seen(self, idx: npt.NDArray[np.int64], generator: torch.Generator | None = None) -> Tensor:
+        """Return frames `(*idx.shape, n_atoms, 3)` nm; with a generator each row of them in a pose of its own, unless
+        the model's frames are canonical."""
+        x = torch.from_numpy(self.frames.positions_nm(idx))
+        if generator is not None and not self.model.config.canonical:
+            x = torch.einsum("bij,b...nj->b...ni", random_rotations(len(x), generator), x)
+        return x.to(self.device)
 
     @torch.no_grad()
-    def reconstruction_error_nm(self, model: LamSlide) -> float:
+    def encode(self, idx: npt.NDArray[np.int64], generator: torch.Generator | None = None) -> Tensor:
+        """Return the latents `(*idx.shape, n_latents, dim)` of frames."""
+        return self.model.encode(self.seen(idx, generator), self.elements)
+
+    @torch.no_grad()
+    def reconstruction_error_nm(self) -> float:
         """Return the root mean square error of held-out frames that went through the autoencoder."""
-        held = self.frames.spread_starts(_HELD_FRAMES, validation=True)
-        x = self.seen(torch.from_numpy(self.frames.positions_nm(held)), None)
-        error = model.decode(model.encode(x, self.molecule.elements), self.n_atoms) - x
+        x = self.seen(self.frames.spread_starts(_HELD_FRAMES, validation=True))
+        error = self.model.decode(self.model.encode(x, self.elements), len(self.elements)) - x
         return float(error.square().sum(-1).mean().sqrt())
 
-    @torch.no_grad()
-    def encode(self, model: LamSlide, idx: npt.NDArray[np.int64]) -> Tensor:
-        """Return the latents `(len(idx), n_latents, dim)` of frames `(n,)` as they are posed."""
-        x = self.seen(torch.from_numpy(self.frames.positions_nm(idx)), None)
-        return model.encode(x, self.molecule.elements)
+    def keep_latents(self) -> None:
+        """Encode every frame once and keep the latents, where that may be done."""
+        n, c = self.frames.n_frames, self.model.config.autoencoder
+        if self.model.config.canonical and 4 * n * c.n_latents * c.latent_dim <= LATENT_CACHE_BYTES:
+            parts = [self.encode(np.arange(k, min(k + _BLOCK, n))).cpu() for k in range(0, n, _BLOCK)]
+            self.latents = torch.cat(parts).to(self.device)
 
-    def keep_latents(self, model: LamSlide) -> None:
-        """Encode every frame once and keep the latents."""
-        parts = [
-            self.encode(model, np.arange(start, min(start + _BLOCK, self.frames.n_frames))).cpu()
-            for start in range(0, self.frames.n_frames, _BLOCK)
-        ]
-        self.latents = torch.cat(parts).to(self.molecule.elements.device)
-
-    def windows(self, model: LamSlide, idx: Tensor, generator: torch.Generator) -> Tensor:
+    def windows(self, idx: Tensor, generator: torch.Generator) -> Tensor:
         """Return the latents `(b, length, n_latents, dim)` of frames `idx` (b, length), each window in its own pose."""
-        if self.latents is not None:
-            return self.latents[idx.to(self.latents.device)]
-        turns = self.poses(model, len(idx), generator)
-        x = self.seen(torch.from_numpy(self.frames.positions_nm(idx.numpy())), turns)
-        with torch.no_grad():
-            return model.encode(x, self.molecule.elements)
+        return self.encode(idx.numpy(), generator) if self.latents is None else self.latents[idx.to(self.device)]
+
+    @torch.no_grad()
+    def normalise_latents(self, seed: int) -> None:
+        """Measure the latents' means and common scale on training frames and set them."""
+        model = self.model
+        model.latent_mean.zero_()
+        model.latent_scale.fill_(1.0)
+        starts = self.frames.window_starts(1, validation=False)
+        n = min(_MEASURED_FRAMES, len(starts))
+        z = self.encode(starts[np.sort(np.random.default_rng(seed).choice(len(starts), size=n, replace=False))])
+        model.latent_mean.copy_(z.mean(0))
+        model.latent_scale.copy_((z - z.mean(0)).square().mean().sqrt())
 
 
 def pick(subjects: Sequence[object], generator: torch.Generator) -> int:
@@ -213,18 +190,6 @@ def pick(subjects: Sequence[object], generator: torch.Generator) -> int:
     if len(subjects) == 1:
         return 0
     return int(torch.randint(len(subjects), (1,), generator=generator))
-
-
-@torch.no_grad()
-def normalise_latents(model: LamSlide, subject: Subject, seed: int, n_frames: int = 20_000) -> None:
-    """Measure the latents' means and common scale on training frames and set them."""
-    model.latent_mean.zero_()
-    model.latent_scale.fill_(1.0)
-    starts = subject.frames.window_starts(1, validation=False)
-    idx = np.random.default_rng(seed).choice(len(starts), size=min(n_frames, len(starts)), replace=False)
-    z = subject.encode(model, starts[np.sort(idx)])
-    model.latent_mean.copy_(z.mean(0))
-    model.latent_scale.copy_((z - z.mean(0)).square().mean().sqrt())
 
 
 # Latents beyond this are not kept: windows are encoded when they are drawn.
@@ -253,7 +218,7 @@ class TrainingConfig:
     # Present every other window backwards: exact for positions of a system in equilibrium (microscopic
     # reversibility), and each rare event then shows how it begins and how it ends.
     time_reversal: bool = False
-    # Windows are drawn with strides up to this lag, each as likely, and the network is told which.
+    # Windows are drawn with strides up to this lag, each as likely; the network takes the lag as an input.
     longest_lag_ps: float | None = None
 
     def stages(self, *, with_autoencoder: bool = True) -> tuple[StageConfig, StageConfig]:
@@ -267,11 +232,6 @@ class TrainingConfig:
         two = StageConfig("flow", self.stage_two_batch, self.stage_two_rate, budget_two, self.stage_two_steps,
                           seed=self.seed + 1, **common)  # fmt: skip
         return one, two
-
-
-def is_trained(out: Path) -> bool:
-    """Return whether `out` is there and no state of an interrupted training is beside it."""
-    return out.exists() and not list(out.parent.glob(f"{out.stem}.*.train.safetensors"))
 
 
 def train_lam_slide(
@@ -295,26 +255,24 @@ def train_lam_slide(
     torch.manual_seed(config.seed)
     device = torch.device(config.device)
     model = LamSlide(model_config).to(device)
-    subject = Subject.of(frames, model)
-    shown = _Shown(model, subject, strides)
+    subject = Subject(frames, model, strides)
     one, two = config.stages(with_autoencoder=start is None)
     if start is not None:
         _check_start(start, frames, model_config)
         model.load_state_dict(start.model.state_dict())
     domain = training_domain(frames, strides=strides if len(strides) > 1 else ())
-    origin = {"reference_ns": frames.total_ps * 1e-3, "sources": list(frames.sources)}
 
     def stages() -> Iterator[Stage]:
         if start is None:
-            yield _stage_one(shown, one)
-            normalise_latents(model, subject, config.seed)
-        yield _stage_two(shown, config, two)
+            yield _stage_one(subject, one)
+            subject.normalise_latents(config.seed)
+        yield _stage_two(subject, config, two)
 
     def write(spent_s: list[float]) -> None:
         spent_one, spent_two = [0.0, *spent_s][-2:]
         settings = {"seed": config.seed, "time_reversal": config.time_reversal, "stage_one_s": round(spent_one, 1),
                     "stage_two_s": round(spent_two, 1)}  # fmt: skip
-        save_weights(out, model, domain, provenance_of(origin, settings, start))
+        save_weights(out, model, domain, provenance_of(frames.origin, settings, start))
 
     train_stages(stages(), out, write, device=device, resume=resume, progress=progress)
     return out
@@ -327,10 +285,10 @@ def _resolve(frames: TrainingFrames, model_config: LamSlideConfig, config: Train
     n, pool = frames.scene.n_atoms, model_config.autoencoder.identifier_pool
     if n > pool:
         raise InputError(f"{n} atoms need autoencoder.identifier_pool >= {n}, not {pool}.")
-    told = model_config.approximator
-    if config.longest_lag_ps is not None:
-        told = replace(told, lag_range_ps=(frames.lag_ps, config.longest_lag_ps))
-    return replace(model_config, approximator=told)
+    if config.longest_lag_ps is None:
+        return model_config
+    lags = replace(model_config.approximator, lag_range_ps=(frames.lag_ps, config.longest_lag_ps))
+    return replace(model_config, approximator=lags)
 
 
 def _strides(frames: TrainingFrames, model_config: LamSlideConfig) -> tuple[int, ...]:
@@ -350,29 +308,17 @@ def _strides(frames: TrainingFrames, model_config: LamSlideConfig) -> tuple[int,
     return strides
 
 
-@dataclass(frozen=True, eq=False)
-class _Shown:
-    """What both stages are shown; `strides` that windows are drawn with."""
-
-    model: LamSlide
-    subject: Subject
-    strides: tuple[int, ...]
-
-
-def _stage_one(shown: _Shown, stage: StageConfig) -> Stage:
-    model, subject = shown.model, shown.subject
+def _stage_one(subject: Subject, stage: StageConfig) -> Stage:
     own = subject.frames.window_starts(1, validation=False)
 
     def loss_fn(generator: torch.Generator) -> tuple[Tensor, dict[str, Tensor]]:
         idx = own[torch.randint(len(own), (stage.batch,), generator=generator).numpy()]
-        x = torch.from_numpy(subject.frames.positions_nm(idx))
-        x = subject.seen(x, subject.poses(model, len(x), generator))
-        return autoencoder_loss(model, x, subject.molecule.elements, generator)
+        return autoencoder_loss(subject.model, subject.seen(idx, generator), subject.elements, generator)
 
     def validate() -> dict[str, float]:
-        return {"validation_rmsd_nm": subject.reconstruction_error_nm(model)}
+        return {"validation_rmsd_nm": subject.reconstruction_error_nm()}
 
-    return Stage(model.autoencoder, stage, loss_fn, validate, saves=False)
+    return Stage(subject.model.autoencoder, stage, loss_fn, validate, saves=False)
 
 
 def window_frames(first: Tensor, length: int, generator: torch.Generator, *, time_reversal: bool,
@@ -387,30 +333,27 @@ def window_frames(first: Tensor, length: int, generator: torch.Generator, *, tim
     return torch.where(backwards, idx.flip(1), idx)
 
 
-def _stage_two(shown: _Shown, config: TrainingConfig, stage: StageConfig) -> Stage:
-    model, subject, strides = shown.model, shown.subject, shown.strides
-    length, device = model.config.approximator.chunk_frames, model.latent_mean.device
-    if len(strides) > 1:
-        wide = StrideSampler.of(subject.frames, length, strides)
-    starts = torch.from_numpy(subject.frames.window_starts(length, validation=False))
+def _stage_two(subject: Subject, config: TrainingConfig, stage: StageConfig) -> Stage:
+    model, device, frames = subject.model, subject.device, subject.frames
+    length, several = model.config.approximator.chunk_frames, len(subject.strides) > 1
+    starts = torch.from_numpy(frames.window_starts(length, validation=False))
+    wide = StrideSampler.of(frames, length, subject.strides)
     model.autoencoder.requires_grad_(False)
     if config.compile:
         model.approximator.compile()
         model.autoencoder.decode = torch.compile(model.autoencoder.decode)  # type: ignore[method-assign]
-    c = model.config.autoencoder
-    if model.config.canonical and 4 * subject.frames.n_frames * c.n_latents * c.latent_dim <= LATENT_CACHE_BYTES:
-        subject.keep_latents(model)
+    subject.keep_latents()
 
     def loss_of(
         idx: Tensor, stride: Tensor | None, tau: Tensor, generator: torch.Generator
     ) -> tuple[Tensor, dict[str, Tensor]]:
-        latents = subject.windows(model, idx, generator)
-        lag = model.embedded_lag(None if stride is None else (stride * subject.frames.lag_ps).to(device), len(idx))
-        return flow_loss(model, FlowWindows(latents, subject.n_atoms, lag), tau, generator)
+        latents = subject.windows(idx, generator)
+        lag = model.embedded_lag(None if stride is None else (stride * frames.lag_ps).to(device), len(idx))
+        return flow_loss(model, latents, len(subject.elements), tau, generator, lag)
 
     def loss_fn(generator: torch.Generator) -> tuple[Tensor, dict[str, Tensor]]:
         stride = None
-        if len(strides) > 1:
+        if several:
             first, stride = wide.draw(stage.batch, generator)
         else:
             first = starts[torch.randint(len(starts), (stage.batch,), generator=generator)]
@@ -418,7 +361,14 @@ def _stage_two(shown: _Shown, config: TrainingConfig, stage: StageConfig) -> Sta
         idx = window_frames(first, length, generator, time_reversal=config.time_reversal, stride=stride)
         return loss_of(idx, stride, tau, generator)
 
-    held, held_stride = _held_windows(subject, length, strides)
+    held_stride = None
+    if several:
+        sampler = StrideSampler.of(frames, length, subject.strides, validation=True)
+        held, held_stride = sampler.draw(_HELD_WINDOWS, torch.Generator().manual_seed(0))
+    else:
+        held = torch.from_numpy(frames.window_starts(length, validation=True))
+        held = held[torch.linspace(0, len(held) - 1, min(_HELD_WINDOWS, len(held))).long()]
+    held = window_frames(held, length, torch.Generator(), time_reversal=False, stride=held_stride)
     with_bf16 = stage.bf16 and bf16_pays(device.type)
 
     @torch.no_grad()
@@ -433,17 +383,6 @@ def _stage_two(shown: _Shown, config: TrainingConfig, stage: StageConfig) -> Sta
     return Stage(model.approximator, stage, loss_fn, validate)
 
 
-def _held_windows(subject: Subject, length: int, strides: tuple[int, ...]) -> tuple[Tensor, Tensor | None]:
-    """Return up to 256 held-out windows, evenly spaced, as frames `(b, length)`, and their strides."""
-    if len(strides) > 1:
-        sampler = StrideSampler.of(subject.frames, length, strides, validation=True)
-        first, stride = sampler.draw(256, torch.Generator().manual_seed(0))
-        return first[:, None] + torch.arange(length) * stride[:, None], stride
-    held = torch.from_numpy(subject.frames.window_starts(length, validation=True))
-    held = held[torch.linspace(0, len(held) - 1, min(256, len(held))).long()]
-    return held[:, None] + torch.arange(length), None
-
-
 def _check_start(start: Weights, frames: TrainingFrames, model_config: LamSlideConfig) -> None:
     """Refuse (InputError) to go on from weights of another molecule, frame spacing or configuration."""
     name, of = start.path.name, start.domain
@@ -455,41 +394,39 @@ def _check_start(start: Weights, frames: TrainingFrames, model_config: LamSlideC
         raise InputError(f"{name} steps {of.lag_ps:g} ps from frame to frame; these trajectories {frames.lag_ps:g} ps.")
 
 
-# LaM-SLidE behind the verb `train`: choices for the references, settings, and the start of the training.
-
+REVERSIBLE = arch.Choice("training.time_reversal", True, "MD at constant temperature reads alike backwards")
 _RESOLVED = frozenset({"budget_s", "stage_one_steps", "stage_two_steps", "seed", "device"})
 
 
-class LamSlideTrainer(Trainer):
+class LamSlideTrainer(arch.Trainer):
     """Trains LaM-SLidE. One molecule at one spacing of frames gets the defaults if they hold its atoms."""
 
     goes_on = True
     learns_lags = True
 
-    def check(self, request: TrainingRequest) -> None:
+    def check(self, request: arch.TrainingRequest) -> None:
         """See `Trainer.check`."""
         super().check(request)
         if request.steps is not None and request.steps < 2:
             raise InputError("`steps` must be at least 2: one for each stage.")
 
-    def choose(self, references: References, request: TrainingRequest) -> tuple[Choice, ...]:
+    def choose(self, references: References, request: arch.TrainingRequest) -> tuple[arch.Choice, ...]:
         """See `Trainer.choose`."""
-        survey, found = references.survey, list[Choice]()
-        if request.start_from is None:
-            default = AutoencoderConfig.identifier_pool
-            pool = request.model.get("autoencoder", {}).get("identifier_pool", default)
-            if (n := survey.scenes[0].n_atoms) > pool:
-                found.append(Choice("model.autoencoder.identifier_pool", n, f"{n} atoms, more than {pool} identifiers"))
-            if (request.longest_lag_ps or request.training.get("longest_lag_ps")) and survey.equilibrium:
-                found.append(Choice("training.time_reversal", True, "MD at constant temperature reads alike backwards"))
-        return tuple(choice for choice in found if not _is_set(choice.key, request))
-
-    def settings(self, request: TrainingRequest) -> Settings:
-        """See `Trainer.settings`."""
+        survey, found = references.survey, list[arch.Choice]()
         if request.start_from is not None:
-            model = LamSlideConfig.from_dict(read_header(request.start_from).config)
-        else:
-            model = LamSlideConfig.from_dict(request.model)
+            return ()
+        pool = AutoencoderConfig.identifier_pool
+        if "identifier_pool" not in request.model.get("autoencoder", {}) and (n := survey.scenes[0].n_atoms) > pool:
+            why = f"{n} atoms, more than {pool} identifiers"
+            found.append(arch.Choice("model.autoencoder.identifier_pool", n, why))
+        lags = request.longest_lag_ps or request.training.get("longest_lag_ps")
+        if lags and survey.equilibrium and "time_reversal" not in request.training:
+            found.append(REVERSIBLE)
+        return tuple(found)
+
+    def settings(self, request: arch.TrainingRequest) -> arch.Settings:
+        """See `Trainer.settings`."""
+        model = request.model if request.start_from is None else read_header(request.start_from).config
         steps, first = request.steps, None
         if steps is not None:
             first = 0 if request.start_from is not None else max(1, round(steps * STAGE_ONE_SHARE))
@@ -502,9 +439,9 @@ class LamSlideTrainer(Trainer):
         }
         if request.longest_lag_ps is not None:
             asked["longest_lag_ps"] = request.longest_lag_ps
-        return Settings(model, request.settings(TrainingConfig, asked), _RESOLVED)
+        return arch.Settings(LamSlideConfig.from_dict(model), request.settings(TrainingConfig, asked), _RESOLVED)
 
-    def prepare(self, references: References, request: TrainingRequest) -> Prepared:
+    def prepare(self, references: References, request: arch.TrainingRequest) -> arch.Prepared:
         """See `Trainer.prepare`."""
         settings = self.settings(request)
         model: LamSlideConfig = settings.model
@@ -514,7 +451,7 @@ class LamSlideTrainer(Trainer):
             frames.window_starts(model.approximator.chunk_frames, validation=validation)
         share_one = 0.0 if start is not None else STAGE_ONE_SHARE
 
-        def run(advance: AdvanceFn) -> Path:
+        def run(advance: arch.AdvanceFn) -> Path:
             def report(stage: str, share: float, metrics: dict[str, float]) -> None:
                 advance(stage, share * share_one if stage == "autoencoder" else share_one + share * (1 - share_one))
 
@@ -522,21 +459,11 @@ class LamSlideTrainer(Trainer):
                 frames, request.out, model, settings.training, start=start, resume=request.resume, progress=report
             )
 
-        return Prepared(frames.scene.name, run)
+        return arch.Prepared(frames.scene.name, run)
 
 
-def _is_set(key: str, request: TrainingRequest) -> bool:
-    """Return whether the configuration file holds this key already."""
-    found: Any = {"model": request.model, "training": request.training}
-    for name in key.split("."):
-        if not isinstance(found, dict) or name not in found:
-            return False
-        found = found[name]
-    return True
+def _suits(survey: Survey) -> arch.Suitability | None:
+    return arch.Suitability(0, "one molecule") if survey.one_molecule else None
 
 
-def _suits(survey: Survey) -> Suitability | None:
-    return Suitability(0, "one molecule") if survey.one_molecule else None
-
-
-LAM_SLIDE = Architecture("lam-slide", LamSlideConfig.from_dict, LamSlide, LamSlideTrainer, _suits)
+LAM_SLIDE = arch.Architecture("lam-slide", LamSlideConfig.from_dict, LamSlide, LamSlideTrainer, _suits)

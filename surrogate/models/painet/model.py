@@ -1,54 +1,244 @@
-"""PAINET: latent steps of energy-descent attention, one per future frame, decoded in parallel by one EGNN."""
+"""PAINET and its training: latent steps of energy-descent attention, one per future frame, decoded by one EGNN."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, dataclass, replace
-from typing import TYPE_CHECKING, Any, ClassVar, cast
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any, ClassVar
 
+import numpy as np
 import torch
 from torch import Tensor, nn
+from torch.nn import functional as F
 
-from surrogate.models.architecture import build
-from surrogate.models.painet.attention import EnergyAttention, Pairs, Surroundings, TypeGroups, molecular_pairs
-from surrogate.models.painet.decoders import (
-    Egnn,
-    Graph,
-    Leapfrog,
-    Modes,
-    angular_velocity,
-    centred_template,
-    molecular_graph,
-    spun,
-    turns,
-)
+from surrogate.data import References, TrainingFrames
+from surrogate.models import architecture as arch
+from surrogate.models.architecture import ModelConfig
 from surrogate.models.propagator import Chunk, Molecule, Propagator
+from surrogate.models.weights import Weights, provenance_of, save_weights, training_domain
+from surrogate.training.loop import ProgressFn, Stage, StageConfig, train_stages
 from systems.errors import InputError
-from systems.scene import Scene
 from systems.units import GAS_CONSTANT_KJ_MOL_K
 
-if TYPE_CHECKING:
-    pass
+# Energy-descent all-pair attention with type matrices, dense and factored.
+# With rho_ij(s) = a_ij s - b_ij s^2 and embeddings of unit length, rho'(|h_i - h_j|^2) = phi_ij + psi_ij h_i.h_j, where
+# phi = a - 4 b and psi = 4 b (papers/PAINET, "Particle-type Adaptive Mapping"). The attention's mean over all particles
+# with these weights is a descent step of the energy sum_ij rho_ij(|h_i - h_j|^2).
 
-# PAINET's settings.
+# Index lists of each type's atoms: what the factored form sums over.
+TypeGroups = list[Tensor]
+
+
+def type_groups(elements: Tensor) -> TypeGroups:
+    return [torch.nonzero(elements == number).flatten() for number in torch.unique(elements)]
+
+
+def dense_mean(q: Tensor, k: Tensor, v: Tensor, phi: Tensor, psi: Tensor) -> Tensor:
+    """Return sum_j w_ij v_j / sum_j w_ij with w_ij = phi_ij + psi_ij q_i.k_j.
+
+    `q`, `k` (..., n, d), `v` (..., n, d_v); `phi`, `psi` (..., n, n) by pair of particles.
+    """
+    weights = phi + psi * (q @ k.transpose(-1, -2))
+    return (weights @ v) / weights.sum(-1, keepdim=True)
+
+
+def linear_mean(q: Tensor, k: Tensor, v: Tensor, phi: Tensor, psi: Tensor, groups: TypeGroups) -> Tensor:
+    """The same mean in time linear in n: weights depend on a pair through its types and one product of vectors, so
+    out_i = (sum_b phi_ab s_b + q_i sum_b psi_ab S_b) / (the same with ones), s_b = sum of v, S_b = sum of k v^T over b.
+
+    `phi`, `psi` (..., n_types, n_types) by type; `groups[b]` the atoms of type b, every atom in one of them.
+    """
+    v = torch.cat([v, torch.ones_like(v[..., :1])], dim=-1)
+    sums = torch.stack([v[..., group, :].sum(-2) for group in groups], dim=-2)
+    products = torch.stack([k[..., group, :].transpose(-1, -2) @ v[..., group, :] for group in groups], dim=-3)
+    plain = phi @ sums
+    turned = torch.einsum("...ab,...bde->...ade", psi, products)
+    out = v.new_empty(v.shape)
+    for a, group in enumerate(groups):
+        out[..., group, :] = plain[..., a, None, :] + q[..., group, :] @ turned[..., a, :, :]
+    return out[..., :-1] / out[..., -1:]
+
+
+class EnergyAttention(nn.Module):
+    """One latent step: h <- (1 - eta) h + eta W concat_heads(mean of values), with learned Q, K, V.
+
+    Queries and keys have unit length. Phi = sigmoid(E_phi) and Psi = psi_limit * Phi * sigmoid(E_psi), symmetric, by
+    type and head: Phi >= Psi keeps every weight positive. (A common factor of Phi and Psi, s_1 in the paper, cancels.)
+    `config`: of a model, with `width`, `n_heads`, `head_dim`, eta as `step`, and `psi_limit`, the largest Psi / Phi.
+    """
+
+    def __init__(self, config: Any, n_types: int) -> None:
+        super().__init__()
+        self.n_heads, self.step, self.psi_limit = config.n_heads, config.step, config.psi_limit
+        self.qkv = nn.Linear(config.width, 3 * config.n_heads * config.head_dim)
+        self.out = nn.Linear(config.n_heads * config.head_dim, config.width)
+        self.e_phi = nn.Parameter(torch.zeros(config.n_heads, n_types, n_types))
+        self.e_psi = nn.Parameter(torch.zeros(config.n_heads, n_types, n_types))
+
+    def type_matrices(self) -> tuple[Tensor, Tensor]:
+        """Return Phi and Psi `(n_heads, n_types, n_types)`."""
+        phi, psi = (torch.sigmoid(0.5 * _wide(e + e.transpose(-1, -2))) for e in (self.e_phi, self.e_psi))
+        return phi, self.psi_limit * phi * psi
+
+    def forward(
+        self, h: Tensor, carried: Tensor, types: Tensor, groups: TypeGroups, *, dense: bool
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Embeddings `h` (b, n, width), more values that the attention averages `carried` (b, n, c), types `(n,)` and
+        their atoms `groups` -> embeddings, the means `(b, n_heads, n, c)` of what is carried, and the queries `(b,
+        n_heads, n, head_dim)`, of unit length."""
+        q, k, v = _wide(self.qkv(h)).unflatten(-1, (3, self.n_heads, -1)).permute(2, 0, 3, 1, 4)
+        q, k = F.normalize(q, dim=-1), F.normalize(k, dim=-1)
+        n_own = v.shape[-1]
+        v = torch.cat([v, carried[:, None].expand(-1, self.n_heads, -1, -1)], dim=-1)
+        phi, psi = self.type_matrices()
+        # Sums over all atoms stay in float32: in bf16 the two forms would differ by more than rounding.
+        with torch.autocast(h.device.type, enabled=False):
+            if dense:
+                mean = dense_mean(q, k, v, phi[:, types][:, :, types], psi[:, types][:, :, types])
+            else:
+                present = torch.stack([types[group[0]] for group in groups])
+                phi, psi = (m[:, present][:, :, present] for m in (phi, psi))
+                mean = linear_mean(q, k, v, phi, psi, groups)
+        own, means = mean.split((n_own, carried.shape[-1]), dim=-1)
+        return (1.0 - self.step) * h + self.step * self.out(own.transpose(1, 2).flatten(-2)), means, q
+
+
+def _wide(s: Tensor) -> Tensor:
+    """`s` in float32, or as it is where that is float64."""
+    return s.to(torch.promote_types(s.dtype, torch.float32))
+
+
+# E(n)-equivariant graph network (Satorras 2021) in EGNO's form: PAINET's decoder and, alone, the baseline.
+
+# Kinds of edges: of the pairs that messages run between.
+BOND, SECOND_NEIGHBOUR, NOT_BONDED = 0, 1, 2
+N_KINDS = 3
+
+
+@dataclass(frozen=True, eq=False)
+class Graph:
+    """Directed edges `receiver`, `sender`, `kind` (n_edges,) of one molecule, sorted by receiver, each pair both ways;
+    `degree` (n_atoms,) edges that end in an atom, at least one, so that a mean over none is zero."""
+
+    receiver: Tensor
+    sender: Tensor
+    kind: Tensor
+    degree: Tensor
+
+
+def molecular_graph(molecule: Molecule, *, all_pairs: bool = False) -> Graph:
+    """Return bonds and pairs two bonds apart (the edges of EGNO, Xu 2024), in time linear in the atoms; with
+    `all_pairs` every other pair as well."""
+    n_atoms, device = molecule.n_atoms, molecule.elements.device
+    bonds = torch.cat([molecule.bonds, molecule.bonds.flip(1)])
+    bonds = bonds[bonds[:, 0].argsort(stable=True)]
+    second = bonds.new_zeros((0, 2))
+    if len(bonds):
+        n_bonds = torch.bincount(bonds[:, 0], minlength=n_atoms)
+        first = torch.cumsum(n_bonds, 0) - n_bonds
+        # Every bond (i, j) is followed by each bond (j, k).
+        reach = n_bonds[bonds[:, 1]]
+        start = torch.repeat_interleave(bonds[:, 0], reach)
+        step = torch.arange(int(reach.sum()), device=device) - torch.repeat_interleave(reach.cumsum(0) - reach, reach)
+        end = bonds[torch.repeat_interleave(first[bonds[:, 1]], reach) + step, 1]
+        second = torch.stack([start, end], 1)[start != end]
+    pairs = [bonds, second]
+    if all_pairs:
+        index = torch.arange(n_atoms, device=device)
+        full = torch.cartesian_prod(index, index)
+        pairs.append(full[full[:, 0] != full[:, 1]])
+    kinds = torch.cat([torch.full((len(p),), kind, device=device) for kind, p in enumerate(pairs)])
+    keys = torch.cat([p[:, 0] * n_atoms + p[:, 1] for p in pairs])
+    # A pair of several kinds counts as the closest: a three-membered ring's bonds are bonds.
+    unique, place = torch.unique(keys, return_inverse=True)
+    kind = torch.full((len(unique),), N_KINDS, device=device).scatter_reduce(0, place, kinds, "amin")
+    receiver, sender = unique // n_atoms, unique % n_atoms
+    return Graph(receiver, sender, kind, torch.bincount(receiver, minlength=n_atoms).clamp(min=1))
+
+
+class EgnnLayer(nn.Module):
+    """One round of messages: m_ij = MLP(h_i, h_j, kind_ij, d_ij^2), h_i += MLP(h_i, sum_j m_ij),
+    x_i += phi_v(h_i) v_i + mean_j (x_i - x_j) phi_x(m_ij), and the same with own factors for the velocity u_i.
+
+    v is the initial velocity, which stays. `reach` scales what is added to x and to u, so that the factors are of
+    order one whatever the horizon; their last layers start small: a fresh layer hardly moves.
+    """
+
+    def __init__(self, width: int) -> None:
+        super().__init__()
+        # The message's first layer by parts: what depends on one atom is computed once per atom, not per edge.
+        self.receive = nn.Linear(width, width)
+        self.send = nn.Linear(width, width, bias=False)
+        self.of_distance = nn.Linear(1, width, bias=False)
+        self.of_kind = nn.Embedding(N_KINDS, width)
+        self.message = nn.Linear(width, width)
+        of_pair, of_own = nn.Linear(width, 2, bias=False), nn.Linear(width, 2)
+        self.pair_factor = nn.Sequential(nn.Linear(width, width), nn.SiLU(), of_pair)
+        self.own_factor = nn.Sequential(nn.Linear(width, width), nn.SiLU(), of_own)
+        self.update = nn.Sequential(nn.Linear(2 * width, width), nn.SiLU(), nn.Linear(width, width))
+        for factor in (of_pair, of_own):
+            nn.init.xavier_uniform_(factor.weight, gain=0.01)
+        nn.init.zeros_(of_own.bias)
+
+    def forward(
+        self, h: Tensor, x: Tensor, u: Tensor, v: Tensor, graph: Graph, reach: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """`h` (b, n, width), positions `x`, velocities `u` and `v` (b, n, 3), `reach` (2,) -> h, x, u."""
+        difference = x[:, graph.receiver] - x[:, graph.sender]
+        squared = difference.square().sum(-1, keepdim=True)
+        pre = self.receive(h)[:, graph.receiver] + self.send(h)[:, graph.sender]
+        pre = pre + self.of_distance(squared.to(pre.dtype)) + self.of_kind(graph.kind)
+        message = F.silu(self.message(F.silu(pre)))
+        own = self.own_factor(h).float()
+        pair = self.pair_factor(message).float()
+        moved = torch.cat([difference * pair[..., :1], difference * pair[..., 1:]], dim=-1)
+        moved = gather_sum(moved, graph.receiver, x.shape[1]) / graph.degree[:, None]
+        x_new = x + reach[0] * (own[..., :1] * v + moved[..., :3])
+        u_new = u + reach[1] * (own[..., 1:] * v + moved[..., 3:])
+        gathered = gather_sum(message, graph.receiver, x.shape[1])
+        return h + self.update(torch.cat([h, gathered], dim=-1)), x_new, u_new
+
+
+class Egnn(nn.Module):
+    """A stack of layers; all of it is equivariant to rotations, reflections, translations and atom order."""
+
+    def __init__(self, width: int, n_layers: int) -> None:
+        super().__init__()
+        self.layers = nn.ModuleList(EgnnLayer(width) for _ in range(n_layers))
+
+    def forward(self, h: Tensor, x: Tensor, v: Tensor, graph: Graph, reach: Tensor) -> tuple[Tensor, Tensor]:
+        """Embeddings `(b, n, width)`, positions and velocities `(b, n, 3)` -> positions, velocities `(b, n, 3)`."""
+        u = v
+        for layer in self.layers:
+            h, x, u = layer(h, x, u, v, graph, reach)
+        return x, u
+
+
+def gather_sum(values: Tensor, receiver: Tensor, n_atoms: int) -> Tensor:
+    """Sum edge values `(b, n_edges, d)` over the edges that end in each atom: `(b, n_atoms, d)`."""
+    out = values.new_zeros(values.shape[0], n_atoms, values.shape[-1])
+    return out.index_add(1, receiver, values)
+
+
+# The forecaster.
+
+# Atomic numbers up to xenon; 0 is a particle of a model system.
+N_TYPES = 55
+# Numbers in one layer's messages, of all rows decoded at once. Larger arrays come anew from the system each time: then
+# 10,000 atoms cost five times what 3,000 do.
+MESSAGE_NUMBERS = 2_000_000
 
 
 @dataclass(frozen=True)
-class PainetConfig:
+class PainetConfig(ModelConfig):
     """Size, horizon and physics. `n_new` frames are predicted at once, `frame_stride` reference frames apart: 1 frame
     at a large stride is state-to-state, several are state-to-trajectory.
 
     `attention` 'linear' (factored over types, cost linear in atoms), 'dense' (the same numbers, quadratic) or 'none'
-    (the decoder alone, which is EGNN). `edges` 'bonds' (with second neighbours) or 'all' pairs. `lag_ps` between
-    predicted frames, `temperature_k` and `friction_per_ps` of the bath that refreshes velocities between chunks; a
-    training takes the three from its reference.
-
-    Ours: `n_modes` modes of motion over the whole molecule beside attention and decoder (`Modes`), 0 for none;
-    `free_rotation` takes the rotation of the whole out of what is learned.
-
-    `decoder` 'egnn' (the paper's) or 'leapfrog' (ours: layers are steps of an integrator whose forces keep momentum,
-    angular momentum and depend on positions alone), with `n_radial` functions of the distance per shell of pairs and
-    `n_scalars` and `n_vectors` sums over an atom's neighbours.
+    (the decoder alone, which is EGNN). `lag_ps` between predicted frames, `temperature_k` and `friction_per_ps` of the
+    bath that refreshes velocities between chunks; a training takes the three from its reference.
     """
 
     n_new: int = 8
@@ -58,13 +248,6 @@ class PainetConfig:
     head_dim: int = 16
     n_decoder_layers: int = 4
     attention: str = "linear"
-    edges: str = "bonds"
-    n_modes: int = 0
-    free_rotation: bool = False
-    decoder: str = "egnn"
-    n_radial: int = 12
-    n_scalars: int = 8
-    n_vectors: int = 6
     # Share of the attention's mean in the next embedding, eta of the descent step.
     step: float = 0.5
     # Largest Psi / Phi: below one, weights stay positive whatever the embeddings.
@@ -77,19 +260,9 @@ class PainetConfig:
     def __post_init__(self) -> None:
         if self.attention not in ("linear", "dense", "none"):
             raise InputError(f"attention = {self.attention!r} is unknown; choose linear, dense or none.")
-        if self.edges not in ("bonds", "all"):
-            raise InputError(f"edges = {self.edges!r} is unknown; choose bonds or all.")
-        if self.decoder not in ("egnn", "leapfrog"):
-            raise InputError(f"decoder = {self.decoder!r} is unknown; choose egnn or leapfrog.")
-        if self.n_modes < 0 or (self.decoder == "leapfrog" and (self.n_modes or self.free_rotation)):
-            raise InputError(f"n_modes = {self.n_modes} and free_rotation = {self.free_rotation} go with decoder egnn.")
-        if self.n_radial < 2 or min(self.n_scalars, self.n_vectors, self.n_decoder_layers) < 1:
-            raise InputError(
-                f"n_radial = {self.n_radial} must be at least 2, n_scalars = {self.n_scalars}, n_vectors = "
-                f"{self.n_vectors} and n_decoder_layers = {self.n_decoder_layers} at least 1."
-            )
-        if self.n_new < 1 or self.frame_stride < 1:
-            raise InputError(f"n_new = {self.n_new} and frame_stride = {self.frame_stride} must be at least 1.")
+        for name in ("n_new", "frame_stride", "n_decoder_layers"):
+            if getattr(self, name) < 1:
+                raise InputError(f"{name} = {getattr(self, name)} must be at least 1.")
         if not 0.0 < self.step < 1.0 or not 0.0 <= self.psi_limit < 1.0:
             raise InputError(f"step = {self.step:g} and psi_limit = {self.psi_limit:g} must lie between 0 and 1.")
 
@@ -97,33 +270,20 @@ class PainetConfig:
     def chunk_ps(self) -> float:
         return self.n_new * self.lag_ps
 
-    def to_dict(self) -> dict[str, Any]:
-        return asdict(self)
-
-    @staticmethod
-    def from_dict(record: dict[str, Any]) -> PainetConfig:
-        """Raises InputError for an unknown key, naming the nearest."""
-        return build(PainetConfig, record)
-
-
-# Atomic numbers up to xenon; 0 is a particle of a model system.
-N_TYPES = 55
-# Numbers in one layer's messages, of all rows decoded at once. Larger arrays come anew from the system each time: then
-# 10,000 atoms cost five times what 3,000 do.
-MESSAGE_NUMBERS = 2_000_000
-
 
 @dataclass(frozen=True, eq=False)
 class Structure:
-    """What of a molecule does not change from chunk to chunk: each type's atoms, `bonds` (2, n) both ways, the template
-    of a model with modes, the decoder's edges or pairs."""
+    """What of a molecule does not change from chunk to chunk: each type's atoms and the decoder's edges."""
 
     molecule: Molecule
     groups: TypeGroups
-    bonds: Tensor
-    template: Tensor | None = None
-    graph: Graph | None = None
-    pairs: Pairs | None = None
+    graph: Graph
+
+    def centred(self, values: Tensor) -> tuple[Tensor, Tensor]:
+        """Return `values` (..., n, 3) relative to the centre of mass's, and these (..., 1, 3)."""
+        masses = self.molecule.masses_da
+        centre = ((masses / masses.sum())[:, None] * values).sum(-2, keepdim=True)
+        return values - centre, centre
 
 
 class Painet(Propagator):
@@ -132,14 +292,12 @@ class Painet(Propagator):
     Embeddings start from invariants of the state: element, speed, distance to the centre of mass and the angle between
     the two. A learned vector per frame tells the decoder which one it decodes. Velocities are learned in units of
     `velocity_scale_nm_ps`; `reach` (2,) is what positions and velocities change by over a chunk, in the model's units:
-    both are measured on the training frames. The centre of mass moves on at its velocity, exactly: only
-    the motion about it is learned, with `free_rotation` that in the frame that turns on with the molecule.
+    both are measured on the training frames. The centre of mass moves on at its velocity, exactly: only the motion
+    about it is learned.
     """
 
     arch: ClassVar[str] = "painet"
     config: PainetConfig
-    velocity_scale_nm_ps: Tensor
-    reach: Tensor
 
     def __init__(self, config: PainetConfig) -> None:
         super().__init__()
@@ -149,25 +307,10 @@ class Painet(Propagator):
         self.embed_frame = nn.Parameter(torch.randn(c.n_new, c.width) * 0.1)
         n_attention = 0 if c.attention == "none" else c.n_new
         self.steps = nn.ModuleList(EnergyAttention(c, N_TYPES) for _ in range(n_attention))
-        if c.n_modes:
-            self.surroundings = Surroundings(c.width)
-            self.modes = Modes(c.width, c.n_modes, c.n_new)
-        self.decoder: Egnn | Leapfrog = Egnn(c.width, c.n_decoder_layers)
-        if c.decoder == "leapfrog":
-            self.decoder = Leapfrog(c.width, c.n_decoder_layers, c.n_radial, c.n_scalars, c.n_vectors)
+        self.decoder = Egnn(c.width, c.n_decoder_layers)
         self._known: Structure | None = None
-        self.register_buffer("velocity_scale_nm_ps", torch.ones(()))
-        self.register_buffer("reach", torch.ones(2))
-
-    def featurise(self, scene: Scene) -> Molecule:
-        """See `Propagator.featurise`; `own`: the template (n_atoms, 3) nm, of a model with modes."""
-        if not self.config.n_modes:
-            return Molecule.of(scene)
-        return Molecule.of(scene, torch.tensor(scene.positions_nm - scene.positions_nm.mean(axis=0)).float())
-
-    @property
-    def n_conditioning(self) -> int:
-        return 1
+        self.velocity_scale_nm_ps = nn.Buffer(torch.ones(()))
+        self.reach = nn.Buffer(torch.ones(2))
 
     @property
     def n_new(self) -> int:
@@ -187,24 +330,7 @@ class Painet(Propagator):
         heaviest = int(molecule.elements.max())
         if heaviest >= N_TYPES:
             raise InputError(f"PAINET has types up to atomic number {N_TYPES - 1}; this molecule holds {heaviest}.")
-        present = torch.unique(molecule.elements)
-        groups = [torch.nonzero(molecule.elements == number).flatten() for number in present]
-        all_pairs, template = self.config.edges == "all", None
-        if self.config.n_modes:
-            if molecule.own is None:
-                raise InputError("this model knows a template; make molecules by its `featurise`.")
-            template = centred_template(molecule.own, molecule.masses_da, self.config.length_scale_nm)
-        bonds = torch.cat([molecule.bonds.T, molecule.bonds.T.flip(0)], dim=1)
-        if self._integrates:
-            pairs = molecular_pairs(molecule, all_pairs=all_pairs)
-            return Structure(molecule, groups, bonds, template, pairs=pairs)
-        return Structure(molecule, groups, bonds, template, graph=molecular_graph(molecule, all_pairs=all_pairs))
-
-    def _structure_of(self, molecule: Molecule) -> Structure:
-        """`structure`, made once for chunk after chunk of one molecule."""
-        if self._known is None or self._known.molecule is not molecule:
-            self._known = self.structure(molecule)
-        return self._known
+        return Structure(molecule, type_groups(molecule.elements), molecular_graph(molecule))
 
     def embed(self, x: Tensor, v: Tensor, elements: Tensor) -> Tensor:
         """H(0) `(b, n, width)` from scaled, centred positions and velocities `(b, n, 3)`."""
@@ -214,85 +340,40 @@ class Painet(Propagator):
 
     def forward(self, positions_nm: Tensor, velocities_nm_ps: Tensor, structure: Structure) -> tuple[Tensor, Tensor]:
         """States `(b, n, 3)` -> positions and velocities `(b, n_new, n, 3)` of all future frames, nm and nm/ps."""
+        (x, centre), (v, drift) = structure.centred(positions_nm), structure.centred(velocities_nm_ps)
         scale = self.config.length_scale_nm
-        share = (structure.molecule.masses_da / structure.molecule.masses_da.sum())[:, None]
-        centre, drift = ((share * s).sum(-2, keepdim=True) for s in (positions_nm, velocities_nm_ps))
-        x = (positions_nm - centre) / scale
-        v = (velocities_nm_ps - drift) / self.velocity_scale_nm_ps
-        spin = None
-        if self.config.free_rotation:
-            spin = angular_velocity(x, v, structure.molecule.masses_da)
-            v = v - spun(spin, x)
-        # Leapfrog's forces know positions alone.
-        seen = torch.zeros_like(v) if self._integrates else v
-        h = self.embed(x, seen, structure.molecule.elements)
-        latents = []
-        for t in range(self.n_new):
-            if self.steps:
-                h = self.steps[t](h, structure.molecule.elements, structure.groups)
-            latents.append(h + self.embed_frame[t])
-        frames = torch.stack(latents, dim=1)
-        decode = self._integrate if self._integrates else self._decode
-        x_new, v_new = decode(frames, x, v, structure)
-        if structure.template is not None:
-            moved, changed = self._carried(x, v, structure.template, structure)
-            x_new, v_new = x_new + self.reach[0] * moved, v_new + self.reach[1] * changed
-        x_new, v_new = (s - (share * s).sum(-2, keepdim=True) for s in (x_new, v_new))
+        x_new, v_new = self.moved(x / scale, v / self.velocity_scale_nm_ps, structure)
         times = self.config.lag_ps * torch.arange(1, self.n_new + 1, device=x.device)
-        if spin is not None:
-            turn = turns(spin, times * (self.velocity_scale_nm_ps / scale))
-            v_new = (v_new + spun(spin, x_new)) @ turn
-            x_new = x_new @ turn
         centres = centre[:, None] + times[:, None, None] * drift[:, None]
         return x_new * scale + centres, v_new * self.velocity_scale_nm_ps + drift[:, None]
 
-    def _carried(self, x: Tensor, v: Tensor, template: Tensor, structure: Structure) -> tuple[Tensor, Tensor]:
-        """What the modes do to states `(b, n, 3)`: two of `(b, n_new, n, 3)`, always in the precision of the states."""
-        with torch.autocast(x.device.type, enabled=False):
-            z = self.surroundings(self.embed_type(structure.molecule.elements), structure.bonds)
-            return self.modes(z, x, v, template, structure.molecule.masses_da)
+    def moved(self, x: Tensor, v: Tensor, structure: Structure) -> tuple[Tensor, Tensor]:
+        """The same about the centre of mass, in the model's units."""
+        return tuple(structure.centred(s)[0] for s in self.decoded(x, v, structure))  # type: ignore[return-value]
 
-    @property
-    def _integrates(self) -> bool:
-        # Not by the decoder's class: a compiled decoder is of another.
-        return self.config.decoder == "leapfrog"
-
-    def _decode(self, frames: Tensor, x: Tensor, v: Tensor, structure: Structure) -> tuple[Tensor, Tensor]:
-        """EGNN on latents `(b, n_new, n, width)` and states `(b, n, 3)` -> both `(b, n_new, n, 3)`: so many rows at
-        once as keep its messages in the cache."""
-        graph = structure.graph
-        assert graph is not None
+    def decoded(self, x: Tensor, v: Tensor, structure: Structure) -> tuple[Tensor, Tensor]:
+        """The decoder's frames `(b, n_new, n, 3)`: so many rows at once as keep its messages in the cache."""
+        elements, graph = structure.molecule.elements, structure.graph
+        h = self.embed(x, v, elements)
+        latents = []
+        for t in range(self.n_new):
+            if self.steps:
+                h = self.steps[t](h, h[..., :0], elements, structure.groups, dense=self.config.attention == "dense")[0]
+            latents.append(h + self.embed_frame[t])
         rows = max(1, MESSAGE_NUMBERS // (self.config.width * max(1, len(graph.receiver))))
         x, v = (s[:, None].expand(-1, self.n_new, -1, -1).flatten(0, 1) for s in (x, v))
-        parts = zip(frames.flatten(0, 1).split(rows), x.split(rows), v.split(rows), strict=True)
+        parts = zip(torch.stack(latents, dim=1).flatten(0, 1).split(rows), x.split(rows), v.split(rows), strict=True)
         found = [self.decoder(*part, graph, self.reach) for part in parts]
         x_new, v_new = (torch.cat([part[k] for part in found]) for k in range(2))
         return x_new.unflatten(0, (-1, self.n_new)), v_new.unflatten(0, (-1, self.n_new))
-
-    def _integrate(self, frames: Tensor, x: Tensor, v: Tensor, structure: Structure) -> tuple[Tensor, Tensor]:
-        """The same by the leapfrog decoder, always in the precision of the states: bf16 would round positions."""
-        c, pairs, masses = self.config, structure.pairs, structure.molecule.masses_da.to(x.dtype)
-        assert pairs is not None
-        decoder = cast(Leapfrog, self.decoder)
-        with torch.autocast(x.device.type, enabled=False):
-            frames = frames.to(x.dtype)
-            z = decoder.encode.rounds(self.embed_type(structure.molecule.elements), structure.bonds)
-            of = decoder.encode(z, self.embed_frame, pairs)
-            # Atoms first, then frames, then the batch.
-            h = (frames + z).permute(2, 1, 0, 3).flatten(1, 2)
-            x, v = (s.transpose(0, 1)[:, None].expand(-1, c.n_new, -1, -1).flatten(1, 2) for s in (x, v))
-            share = torch.arange(1, c.n_new + 1, device=x.device, dtype=x.dtype) / c.n_new
-            share = share.repeat_interleave(len(frames))[:, None]
-            times = share * (c.chunk_ps * self.velocity_scale_nm_ps / c.length_scale_nm)
-            x, v = decoder(h, x, v, times, share * self.reach[1] / masses[:, None, None], pairs, of)
-        x, v = (s.unflatten(1, (c.n_new, -1)).permute(2, 1, 0, 3) for s in (x, v))
-        return x, v
 
     def next_chunk(self, last_frames_nm: Tensor, molecule: Molecule, noise: Tensor, *, solver_steps: int = 1,
                    solver: str | None = None, last_velocities_nm_ps: Tensor | None = None) -> Chunk:  # fmt: skip
         """See `Propagator.next_chunk`: one evaluation from velocities that the bath has refreshed."""
         start = self.refreshed(last_velocities_nm_ps, molecule, noise)
-        x, v = self(last_frames_nm[:, -1], start, self._structure_of(molecule))
+        if self._known is None or self._known.molecule is not molecule:
+            self._known = self.structure(molecule)
+        x, v = self(last_frames_nm[:, -1], start, self._known)
         return Chunk(x, v[:, -1])
 
     def refreshed(self, velocities: Tensor | None, molecule: Molecule, noise: Tensor) -> Tensor:
@@ -312,4 +393,194 @@ class EgnnForecaster(Painet):
     arch: ClassVar[str] = "egnn"
 
     def __init__(self, config: PainetConfig) -> None:
-        super().__init__(replace(config, attention="none", n_modes=0))
+        super().__init__(replace(config, attention="none"))
+
+
+@dataclass(frozen=True)
+class PainetTraining:
+    """The optimisation. `noise`: standard deviation of what is added to the state a training window starts from, as a
+    share of what positions and velocities change by over a chunk, so that the model learns to come back from its own
+    errors (Sanchez-Gonzalez 2020). `pushforward`: share of windows that start where the model itself arrives after one
+    chunk from the reference, with no gradient through that chunk (Brandstetter 2022). `velocity_weight`: of the last
+    frame's velocity beside the positions, each in units of its own change over a chunk."""
+
+    budget_s: float | None = None
+    steps: int | None = None
+    batch: int = 32
+    learning_rate: float = 2e-3
+    noise: float = 0.02
+    pushforward: float = 0.3
+    velocity_weight: float = 0.5
+    seed: int = 0
+    bf16: bool = False
+    device: str = "cpu"
+    validate_every_s: float = 60.0
+
+    def __post_init__(self) -> None:
+        if not 0.0 <= self.pushforward <= 1.0:
+            raise InputError(f"pushforward is a share of windows, between 0 and 1, not {self.pushforward:g}.")
+
+
+def for_frames(config: PainetConfig, frames: TrainingFrames) -> PainetConfig:
+    """Return the configuration with frame spacing, temperature and friction of the reference."""
+    bath = frames.conditions
+    return replace(
+        config,
+        lag_ps=frames.lag_ps * config.frame_stride,
+        temperature_k=float(bath.get("temperature_k") or config.temperature_k),
+        friction_per_ps=float(bath.get("friction_per_ps") or 0.0),
+    )
+
+
+def train_painet(
+    frames: TrainingFrames,
+    out: str | Path,
+    model_config: PainetConfig,
+    config: PainetTraining,
+    *,
+    model_class: type[Painet] = Painet,
+    start: Weights | None = None,
+    resume: bool = False,
+    progress: ProgressFn | None = None,
+) -> Path:
+    """Train on `frames`, which carry velocities, and write `out` (.safetensors) with a CSV of the curves beside it.
+
+    `start`: weights of the same configuration that the training begins from, with their scales.
+
+    Raises InputError when the frames carry none or are too short, SimulationError when training diverges.
+    """
+    out = Path(out)
+    if frames.velocities is None:
+        raise InputError(f"{model_class.arch} learns from velocities; these frames carry none.")
+    model_config = for_frames(model_config, frames)
+    torch.manual_seed(config.seed)
+    device = torch.device(config.device)
+    model = model_class(model_config).to(device)
+    structure = model.structure(model.featurise(frames.scene).to(device))
+    windows = StateWindows(frames, model_config, device)
+    model.set_scales(windows.velocity_scale_nm_ps, windows.position_scale_nm, windows.change_scale_nm_ps)
+    if start is not None:
+        if start.model.config != model_config:
+            raise InputError(f"{start.path} is of another configuration, {start.model.config}, than {model_config}.")
+        model.load_state_dict(start.model.state_dict())
+    stage = StageConfig("forecast", config.batch, config.learning_rate, config.budget_s, config.steps,
+                        seed=config.seed, bf16=config.bf16, validate_every_s=config.validate_every_s)  # fmt: skip
+    domain = training_domain(frames, stride=model_config.frame_stride)
+
+    def loss_fn(generator: torch.Generator) -> tuple[Tensor, dict[str, Tensor]]:
+        return forecast_loss(model, structure, windows, config, generator)
+
+    @torch.no_grad()
+    def validate() -> dict[str, float]:
+        return forecast_errors(model, structure, windows)
+
+    def write(spent_s: list[float]) -> None:
+        settings = {"seed": config.seed, "noise": config.noise, "pushforward": config.pushforward,
+                    "training_s": round(sum(spent_s), 1)}  # fmt: skip
+        save_weights(out, model, domain, provenance_of(frames.origin, settings, start))
+
+    stages = [Stage(model, stage, loss_fn, validate)]
+    train_stages(stages, out, write, device=device, resume=resume, progress=progress)
+    return out
+
+
+class StateWindows:
+    """States and their futures, cut from frames: two chunks long, so that a pushforward has a reference to compare
+    with.
+
+    `position_scale_nm`, `change_scale_nm_ps`: root mean square displacement and change of velocity over a chunk, what
+    errors are measured in; `velocity_scale_nm_ps`: root mean square velocity.
+    """
+
+    def __init__(self, frames: TrainingFrames, config: PainetConfig, device: torch.device) -> None:
+        assert frames.velocities is not None
+        self.frames, self.config, self.device = frames, config, device
+        self.velocities = frames.velocities
+        self.span = config.n_new * config.frame_stride
+        self.starts = frames.window_starts(2 * self.span + 1, validation=False)
+        self.held = frames.spread_starts(128, self.span + 1, validation=True)
+        sample = frames.spread_starts(512, 2 * self.span + 1)
+        (x, v), (x_new, v_new) = self.state(sample), self.future(sample)
+        self.position_scale_nm = max(float((x_new - x[:, None]).square().mean().sqrt()), 1e-6)
+        self.change_scale_nm_ps = max(float((v_new - v).square().mean().sqrt()), 1e-6)
+        self.velocity_scale_nm_ps = max(float(v.square().mean().sqrt()), 1e-6)
+
+    def state(self, first: np.ndarray) -> tuple[Tensor, Tensor]:
+        """Positions and velocities `(b, n_atoms, 3)` at frames `first`."""
+        x, v = self.frames.positions_nm(first), self.velocities[first]
+        return torch.from_numpy(x).to(self.device), torch.from_numpy(v).to(self.device)
+
+    def future(self, first: np.ndarray) -> tuple[Tensor, Tensor]:
+        """Positions `(b, n_new, n_atoms, 3)` of the chunk after `first`, velocities `(b, n_atoms, 3)` at its end."""
+        idx = first[:, None] + self.config.frame_stride * np.arange(1, self.config.n_new + 1)
+        x, v = self.frames.positions_nm(idx), self.velocities[idx[:, -1]]
+        return torch.from_numpy(x).to(self.device), torch.from_numpy(v).to(self.device)
+
+
+def forecast_loss(model: Painet, structure: Structure, windows: StateWindows, config: PainetTraining,
+                  generator: torch.Generator) -> tuple[Tensor, dict[str, Tensor]]:  # fmt: skip
+    """Mean square error of all predicted frames and of the last velocity, each over its scale squared."""
+    picked = torch.randint(len(windows.starts), (config.batch,), generator=generator).numpy()
+    first = windows.starts[picked]
+    x, v = windows.state(first)
+    noise = torch.randn(2, *x.shape, generator=generator).to(x.device)
+    pushed = torch.rand(config.batch, generator=generator) < config.pushforward
+    x = x + config.noise * windows.position_scale_nm * noise[0]
+    v = v + config.noise * windows.change_scale_nm_ps * noise[1]
+    if bool(pushed.any()):
+        with torch.no_grad():
+            x_far, v_far = model(x[pushed], v[pushed], structure)
+        x[pushed], v[pushed] = x_far[:, -1], v_far[:, -1]
+        first = np.where(pushed.numpy(), first + windows.span, first)
+    x_true, v_true = windows.future(first)
+    x_new, v_new = model(x, v, structure)
+    position = (x_new - x_true).square().mean() / windows.position_scale_nm**2
+    velocity = (v_new[:, -1] - v_true).square().mean() / windows.change_scale_nm_ps**2
+    loss = position + config.velocity_weight * velocity
+    return loss, {"position": position.detach(), "velocity": velocity.detach()}
+
+
+def forecast_errors(model: Painet, structure: Structure, windows: StateWindows) -> dict[str, float]:
+    """Errors on held-out windows: A-MSE over all predicted frames and F-MSE of the last, per coordinate in Å^2, beside
+    the frozen frame's A-MSE, and the last velocity's root mean square error in nm/ps."""
+    (x, v), (x_true, v_true) = windows.state(windows.held), windows.future(windows.held)
+    x_new, v_new = model(x, v, structure)
+    error = 100.0 * (x_new - x_true).square()
+    return {
+        "validation_a_mse_a2": float(error.mean()),
+        "validation_f_mse_a2": float(error[:, -1].mean()),
+        "frozen_a_mse_a2": float(100.0 * (x[:, None] - x_true).square().mean()),
+        "validation_velocity_nm_ps": float((v_new[:, -1] - v_true).square().mean().sqrt()),
+    }
+
+
+class PainetTrainer(arch.Trainer):
+    """Trains PAINET, or its decoder alone, as `model_class` says."""
+
+    def __init__(self, model_class: type[Painet]) -> None:
+        self.model_class = model_class
+
+    def settings(self, request: arch.TrainingRequest) -> arch.Settings:
+        """See `Trainer.settings`. Frame spacing and bath are the reference's (`for_frames`)."""
+        resolved = arch.RESOLVED | {"lag_ps", "temperature_k", "friction_per_ps"}
+        return arch.Settings(PainetConfig.from_dict(request.model), request.settings(PainetTraining), resolved)
+
+    def prepare(self, references: References, request: arch.TrainingRequest) -> arch.Prepared:
+        """See `Trainer.prepare`. Raises InputError for references without velocities."""
+        settings = self.settings(request)
+        frames = references.frames(canonical=False, velocities=True)
+        span = settings.model.n_new * settings.model.frame_stride
+        frames.window_starts(2 * span + 1, validation=False)
+        frames.window_starts(span + 1, validation=True)
+
+        def run(advance: arch.AdvanceFn) -> Path:
+            return train_painet(
+                frames, request.out, settings.model, settings.training, model_class=self.model_class,
+                resume=request.resume, progress=lambda stage, share, metrics: advance(stage, share),
+            )  # fmt: skip
+
+        return arch.Prepared(frames.scene.name, run)
+
+
+PAINET = arch.Architecture("painet", PainetConfig.from_dict, Painet, partial(PainetTrainer, Painet))
+EGNN = arch.Architecture("egnn", PainetConfig.from_dict, EgnnForecaster, partial(PainetTrainer, EgnnForecaster))

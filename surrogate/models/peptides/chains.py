@@ -2,12 +2,11 @@
 
 Every atom is placed by a bond length, a bond angle and a dihedral on three atoms before it (Parsons et al., J. Comput.
 Chem. 26, 1063 (2005)), from a root in the first residue onwards. One dihedral about each bond that can turn is the
-torsion, told by cosine and sine; the others about that bond are told by how far they are from it. These, lengths and
-angles hardly vary: they are told in standard deviations from their mean, which the data of all peptides give for each
-residue type, and those that references hold rigid are constants. An atom that closes a ring is placed by the lengths of
-both its bonds in the ring instead of by an angle, so that every bond is one of the numbers. Whatever numbers a network
-returns, every frame is one of the right molecule with bonds, angles and handedness as MD has them, and no error grows
-with chain length.
+torsion, given by cosine and sine; the others about that bond by how far they are from it. These, lengths and angles
+hardly vary: they are in standard deviations from their mean, which the data of all peptides give for each residue type,
+and those that references hold rigid are constants. An atom that closes a ring is placed by the lengths of both its
+bonds in the ring instead of by an angle. Whatever numbers a network returns, every frame is one of the right molecule
+with bonds, angles and handedness as MD has them, and no error grows with chain length.
 
 Each number belongs to one residue and has a place (slot) in that residue's token, the same for every residue of a type.
 """
@@ -15,17 +14,16 @@ Each number belongs to one residue and has a place (slot) in that residue's toke
 from __future__ import annotations
 
 import copy
-from dataclasses import dataclass, replace
-from functools import cached_property
+from dataclasses import dataclass, fields, replace
+from functools import cached_property, partial
 
 import numpy as np
 import numpy.typing as npt
 import torch
 from torch import Tensor, nn
+from torch.nn import functional as F
 
-from surrogate.models.peptides.torsion_states import StatedTorsions
-
-# A number told in standard deviations, a torsion's cosine and sine, or what never changes.
+# A number in standard deviations, a torsion's cosine and sine, or what never changes.
 STIFF, TURNING, RIGID = 0, 1, 2
 # What stands for a residue's type in the keys of a free end's coordinates: hydrogens on the first nitrogen, oxygens on
 # the last carbon.
@@ -58,10 +56,6 @@ class ChainLayout:
     types: tuple[str, ...]
 
     @property
-    def n_coordinates(self) -> int:
-        return 3 + 3 * len(self.placed)
-
-    @property
     def turning(self) -> list[tuple[int, int, int, int]]:
         """The rows of `placed` whose dihedral is a torsion."""
         return [row for k, row in enumerate(self.placed) if self.kinds[3 + 3 * k + 2] == TURNING]
@@ -84,17 +78,6 @@ class ChainScale:
 class ChainCode(nn.Module):
     """Frames of one peptide into tokens of its residues and back, exactly but for what is rigid."""
 
-    rows: Tensor
-    closing: Tensor
-    primary: Tensor
-    mean: Tensor
-    deviation: Tensor
-    stiff: Tensor
-    turning: Tensor
-    stiff_at: Tensor
-    turning_at: Tensor
-    filled: Tensor
-
     def __init__(self, layout: ChainLayout, scale: ChainScale) -> None:
         super().__init__()
         self.layout, self.n_slots, self.n_residues = layout, scale.n_slots, len(layout.types)
@@ -102,24 +85,22 @@ class ChainCode(nn.Module):
         at = torch.tensor(layout.residue_of) * self.n_slots
         slots = torch.tensor([scale.slots.get(key, 0) for key in layout.keys])
         stiff, turning = kinds == STIFF, kinds == TURNING
-        fixed = {
-            "rows": torch.tensor(layout.placed, dtype=torch.long).reshape(-1, 4),
-            "closing": torch.tensor(layout.closing, dtype=torch.bool),
-            "primary": torch.tensor(layout.primary, dtype=torch.long),
-            "mean": torch.tensor([scale.mean.get(key, 0.0) for key in layout.keys], dtype=torch.float64),
-            "deviation": torch.tensor([scale.deviation.get(key, 1.0) for key in layout.keys], dtype=torch.float64),
-            "stiff": stiff.nonzero()[:, 0],
-            "turning": turning.nonzero()[:, 0],
-            "stiff_at": (at + slots)[stiff],
-            "turning_at": (at + slots)[turning],
-        }
-        for name, tensor in fixed.items():
-            self.register_buffer(name, tensor, persistent=False)
+        fixed = partial(nn.Buffer, persistent=False)
+        mean, deviation = (
+            [of.get(key, d) for key in layout.keys] for of, d in ((scale.mean, 0.0), (scale.deviation, 1.0))
+        )
+        self.rows = fixed(torch.tensor(layout.placed, dtype=torch.long).reshape(-1, 4))
+        self.closing = fixed(torch.tensor(layout.closing, dtype=torch.bool))
+        self.primary = fixed(torch.tensor(layout.primary, dtype=torch.long))
+        self.mean = fixed(torch.tensor(mean, dtype=torch.float64))
+        self.deviation = fixed(torch.tensor(deviation, dtype=torch.float64))
+        self.stiff, self.turning = fixed(stiff.nonzero()[:, 0]), fixed(turning.nonzero()[:, 0])
+        self.stiff_at, self.turning_at = fixed((at + slots)[stiff]), fixed((at + slots)[turning])
         filled = torch.zeros(self.n_residues * self.n_slots, dtype=torch.bool)
         filled[self.stiff_at] = True
         filled[self.turning_at] = True
         filled[self.turning_at + 1] = True
-        self.register_buffer("filled", filled.reshape(self.n_residues, self.n_slots), persistent=False)
+        self.filled = nn.Buffer(filled.reshape(self.n_residues, self.n_slots), persistent=False)
         self.levels = _levels(layout)
 
     def encode(self, frames: Tensor) -> Tensor:
@@ -164,12 +145,89 @@ class ChainCode(nn.Module):
         return x
 
 
+# States of torsions with barriers.
+
+# Beyond the second barrier phi > 0 is the far end of the strands' basin, which reaches across 180 degrees.
+POSITIVE_PHI_DEG = (0.0, 130.0)
+# Well inside either side, away from both barriers.
+POSITIVE_CORE_DEG, NEGATIVE_CORE_DEG = (30.0, 90.0), (-175.0, -45.0)
+# Of one residue: phi, psi, then those of its side chain outwards; and of one torsion.
+MOST_TORSIONS, MOST_STATES = 7, 3
+FIRST_OF_SIDE_CHAIN = 2
+# Where the first state begins and where the next ones do, counted from there, degrees: phi (negative, positive), psi
+# (strands, helices), a bond between tetrahedral atoms (gauche+, trans, gauche-), one to an aromatic ring (its sides).
+# Psi's barrier lies elsewhere before a proline, whose ring is in the way of helices.
+Kind = tuple[float, tuple[float, float]]
+PHI = (POSITIVE_PHI_DEG[1], (360.0 - POSITIVE_PHI_DEG[1], 360.0))
+PSI = (75.0, (165.0, 360.0))
+PSI_BEFORE_PROLINE = (25.0, (215.0, 360.0))
+THREEFOLD = (0.0, (120.0, 240.0))
+RING = (0.0, (180.0, 360.0))
+
+
+@dataclass(frozen=True, eq=False)
+class StatedTorsions:
+    """The torsions of one peptide that have states: `quads` (n, 4) atoms; `residue` and `slot` (n,), where their states
+    stand in `(n_residues, MOST_TORSIONS)`; `first_deg` (n,), `edges_deg` (n, 2) as of PHI."""
+
+    quads: Tensor
+    residue: Tensor
+    slot: Tensor
+    first_deg: Tensor
+    edges_deg: Tensor
+    n_residues: int
+
+    @staticmethod
+    def of(rows: list[tuple[list[int], int, int, Kind]], n_residues: int) -> StatedTorsions:
+        """Return those of `rows`: four atoms, residue, slot, and PHI, PSI, THREEFOLD or RING."""
+        quads, residue, slot = (torch.tensor([row[k] for row in rows], dtype=torch.long) for k in range(3))
+        first = torch.tensor([kind[0] for *_, kind in rows])
+        edges = torch.tensor([kind[1] for *_, kind in rows]).reshape(-1, MOST_STATES - 1)
+        return StatedTorsions(quads.reshape(-1, 4), residue, slot, first, edges, n_residues)
+
+    def to(self, device: torch.device) -> StatedTorsions:
+        tensors = {f.name: getattr(self, f.name).to(device) for f in fields(self) if f.name != "n_residues"}
+        return replace(self, **tensors)
+
+    @cached_property
+    def ends_deg(self) -> Tensor:
+        """Where each state begins and the next one does, `(n, MOST_STATES + 1)`, degrees from `first_deg` on."""
+        ends = F.pad(self.edges_deg, (1, 1))
+        ends[:, -1] = 360.0
+        return ends
+
+    @property
+    def middles_deg(self) -> Tensor:
+        """The middle of each state, `(n, MOST_STATES)`, degrees; of no meaning where there are fewer."""
+        return self.first_deg[:, None] + (self.ends_deg[:, 1:] + self.ends_deg[:, :-1]) / 2.0
+
+    @cached_property
+    def counts(self) -> Tensor:
+        """How many states each torsion has, `(n_residues, MOST_TORSIONS)`; 0 where there is none."""
+        found = self.residue.new_zeros(self.n_residues, MOST_TORSIONS)
+        found[self.residue, self.slot] = 1 + (self.edges_deg < 360.0).sum(-1)
+        return found
+
+    def states(self, angles: Tensor) -> Tensor:
+        """Angles of these torsions `(..., n)`, rad -> their states `(..., n_residues, MOST_TORSIONS)`; 0 where there is
+        no torsion."""
+        ahead = (angles.rad2deg() - self.first_deg) % 360.0
+        found = angles.new_zeros(*angles.shape[:-1], self.n_residues, MOST_TORSIONS, dtype=torch.long)
+        found[..., self.residue, self.slot] = (ahead[..., None] >= self.edges_deg).sum(-1)
+        return found
+
+
+def conditioning_states(states: Tensor, counts: Tensor) -> Tensor:
+    """States `(..., r, MOST_TORSIONS)` -> numbers `(..., r, MOST_TORSIONS * MOST_STATES)`, 1 for the state that each
+    torsion is in, 0 for others and where `counts` (r, MOST_TORSIONS) says that there is none."""
+    return (F.one_hot(states, MOST_STATES) * (counts > 0)[..., None]).flatten(-2).float()
+
+
 @dataclass(frozen=True, eq=False)
 class ChainFeatures:
-    """What a model of peptides is told of one: its `code`, the types of its residues and their neighbours as numbers
-    `places` (n_residues, 3), the `template_nm` (n_atoms, 3), which frames are laid on by the atoms `fitted`, the
-    torsions that have states, `stated`, and how near two atoms may come, `least_nm` (n_atoms, n_atoms), 0 where they
-    are bonded or nearly."""
+    """A peptide's features: its `code`, the types of its residues and their neighbours as numbers `places` (n_residues,
+    3), the `template_nm` (n_atoms, 3), which frames are laid on by the atoms `fitted`, the torsions that have states,
+    `stated`, and how near two atoms may come, `least_nm` (n_atoms, n_atoms), 0 where they are bonded or nearly."""
 
     code: ChainCode
     places: Tensor
@@ -198,7 +256,7 @@ class ChainFeatures:
 
     @cached_property
     def state_at(self) -> Tensor:
-        """Which of its residue's torsions `(n_residues, n_slots)` each number tells of; -1 of those without states."""
+        """Which of its residue's torsions each number belongs to, `(n_residues, n_slots)`; -1 without states."""
         found = torch.full_like(self.code.filled, -1, dtype=torch.long).flatten()
         found[self.stated_at] = found[self.stated_at + 1] = self.stated.slot
         return found.reshape(self.code.filled.shape)
@@ -283,11 +341,11 @@ def _levels(layout: ChainLayout) -> list[list[int]]:
     return found
 
 
-# Frames of peptides as the flow leaves them, set right by small turns: into their states, and out of each other.
-# A flow draws some torsions a few degrees beyond the end of the state that it was told, rotors above all, and some
-# atoms nearer to each other than they ever come in MD. Drawing whole chunks again for that costs more than the chunks
-# themselves, and favours tight ones. Torsions are mirrored at the end of their state instead, and those of frames in
-# which atoms overlap are turned downhill until none do: by a few degrees. What takes more is left to be drawn again.
+# Frames of peptides as the flow leaves them, mended by small turns. A flow draws some torsions a few degrees beyond the
+# end of the state that it should be in, rotors above all, and some atoms nearer to each other than they ever come in
+# MD. Drawing whole chunks again for that costs more than the chunks themselves, and favours tight ones. Torsions are
+# mirrored at the end of their state instead, and those of frames in which atoms overlap are turned downhill until none
+# do.
 
 # A torsion is mirrored that is not further beyond the end of its state; it then stands at least so far inside.
 _MIRRORED_DEG, _INSIDE_DEG = 30.0, 0.05
@@ -299,7 +357,7 @@ _ROOM = 1.03
 _TURNED_AT_ONCE = 1024
 
 
-def resolve_settings(tokens: Tensor, states: Tensor, chain: ChainFeatures) -> tuple[Tensor, Tensor, Tensor]:
+def mended(tokens: Tensor, states: Tensor, chain: ChainFeatures) -> tuple[Tensor, Tensor, Tensor]:
     """Tokens `(n, n_residues, n_slots)` of frames that should be in `states` (n, n_residues, MOST_TORSIONS) -> frames
     `(n, n_atoms, 3)` nm, in the pose that the root has; and which of them `(n,)` could not be set right: those with a
     torsion that is in another state, and those in which atoms overlap."""

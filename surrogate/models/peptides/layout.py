@@ -5,9 +5,8 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Iterable
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from itertools import product
-from typing import Any
 
 import networkx as nx
 import numpy as np
@@ -15,30 +14,9 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from surrogate.data.frames import fitted_atoms
-from surrogate.models.architecture import build
-from surrogate.models.peptides.chains import (
-    FREE_ENDS,
-    RIGID,
-    STIFF,
-    TURNING,
-    ChainCode,
-    ChainFeatures,
-    ChainLayout,
-    ChainScale,
-    internal_coordinates,
-)
-from surrogate.models.peptides.torsion_states import (
-    FIRST_OF_SIDE_CHAIN,
-    MOST_TORSIONS,
-    PHI,
-    PSI,
-    PSI_BEFORE_PROLINE,
-    RING,
-    THREEFOLD,
-    Kind,
-    StatedTorsions,
-)
+from surrogate.data import fitted_atoms
+from surrogate.models.architecture import ModelConfig
+from surrogate.models.peptides import chains
 from systems.chemistry.geometry import torsion
 from systems.chemistry.graph import backbone_torsions, bonded_graph, exclusions, match_atoms, ring_bonds
 from systems.chemistry.residues import template_for
@@ -46,8 +24,6 @@ from systems.chemistry.validity import CLASH_AT_MOST_NM
 from systems.errors import InputError, OutOfDomainError, PreparationError
 from systems.prepare.peptide import build_peptide
 from systems.scene import Scene
-
-# A peptide under the names and in the atom order of `systems.prepare.peptide`, whichever program wrote its file.
 
 # Forms of a residue that differ in hydrogens alone, the commonest at pH 7 first.
 _FORMS = {"HIS": ("HIE", "HID", "HIP"), "ASP": ("ASP", "ASH"), "GLU": ("GLU", "GLH"), "LYS": ("LYS", "LYN")}
@@ -85,8 +61,6 @@ def standard_peptide(scene: Scene) -> tuple[Scene, npt.NDArray[np.int64]]:
     )
 
 
-# Peptides as residues with internal coordinates (`models.peptides.chains`), and the scale of these in references.
-
 # A length that varies by less, by rounding alone, is one that the reference holds rigid.
 RIGID_NM = 2e-4
 # Before the first residue, and after the last.
@@ -97,7 +71,7 @@ _LENGTH, _ANGLE, _DIHEDRAL = "length", "angle", "dihedral"
 _ROOTS = (("CH3", "C", "O"), ("N", "CA", "C"))
 # The free ends of a chain, whose coordinates are alike whatever residue bears them. Proline's nitrogen, which is in a
 # ring, bears an end of its own, and so does lysine's, whose rotor has no states.
-_AMMONIUM, _CARBOXYLATE = FREE_ENDS
+_AMMONIUM, _CARBOXYLATE = chains.FREE_ENDS
 # Glycine's phi has no higher barrier, proline's ring holds it.
 _FREE_PHI = ("GLY", "PRO")
 # Side chains with as many torsions as there are places.
@@ -107,7 +81,7 @@ _BACKBONE = ("N", "CA", "C", "CH3")
 _TETRAHEDRAL = {"C": 4, "N": 4, "O": 2, "S": 2}
 
 
-def chain_layout(scene: Scene) -> ChainLayout:
+def chain_layout(scene: Scene) -> chains.ChainLayout:
     """Return how the atoms of one peptide chain follow from internal coordinates.
 
     Residues and atom names are those of `systems.prepare.peptide.build_peptide`; a chain with other names is matched to
@@ -136,7 +110,7 @@ class _Builder:
         self.keys: list[str] = []
         self.kinds: list[int] = []
 
-    def layout(self) -> ChainLayout:
+    def layout(self) -> chains.ChainLayout:
         a, b, c = root = self._root()
         self._add(self.residue[b], (_LENGTH, (a, b)), (_LENGTH, (c, b)), (_ANGLE, (a, b, c)))
         before = {a: b, c: b}
@@ -161,7 +135,7 @@ class _Builder:
                     self._place(atom, near, next_, beside[0], None)
                 else:
                     self._place(atom, near, next_, last, None if near == b else first)
-        return ChainLayout(
+        return chains.ChainLayout(
             self.scene.n_atoms, root, tuple(self.placed), tuple(self.closing), tuple(self.primary),
             tuple(self.residue_of), tuple(self.keys), tuple(self.kinds), tuple(self.scene.residue_names),
         )  # fmt: skip
@@ -253,7 +227,7 @@ class _Builder:
     def _add(self, owner: int, *coordinates: tuple[str, tuple[int, ...]], turning: bool = False) -> None:
         for what, atoms in coordinates:
             self.residue_of.append(owner)
-            self.kinds.append(TURNING if turning and what == _DIHEDRAL else STIFF)
+            self.kinds.append(chains.TURNING if turning and what == _DIHEDRAL else chains.STIFF)
             names = [self._name(i, owner) for i in atoms]
             if what != _DIHEDRAL and names[0] > names[-1]:
                 names.reverse()
@@ -268,7 +242,7 @@ class _Builder:
 
 
 @dataclass(frozen=True)
-class PeptideConfig:
+class PeptideConfig(ModelConfig):
     """`types`: of residues that training saw. `shortest_ps`, `longest_ps`: times after the given frame that it was
     shown. `innovation`: the flow runs on innovations, else on the coordinates themselves. `conditioning_noise`: added
     to the given frame in training, in standard deviations. `turning_weight`: what a torsion's numbers count in the loss
@@ -289,15 +263,7 @@ class PeptideConfig:
     tau_location: float = 0.5
     tau_scale: float = 1.4
     types: tuple[str, ...] = ()
-    scale: ChainScale | None = None
-
-    def to_dict(self) -> dict[str, Any]:
-        return asdict(self)
-
-    @staticmethod
-    def from_dict(record: dict[str, Any]) -> PeptideConfig:
-        """Raises InputError for an unknown key, naming the nearest."""
-        return build(PeptideConfig, record)
+    scale: chains.ChainScale | None = None
 
     @property
     def forgotten_ps(self) -> float:
@@ -326,15 +292,15 @@ class PeptideConfig:
         return torch.tensor([row[1:-1], row[:-2], row[2:]]).T
 
 
-def chain_features(scene: Scene, config: PeptideConfig) -> ChainFeatures:
-    """Return what a model of peptides is told of one. Raises InputError as `chain_layout` and `settled` do."""
+def chain_features(scene: Scene, config: PeptideConfig) -> chains.ChainFeatures:
+    """Return a peptide's features. Raises InputError as `chain_layout` and `resolved` do."""
     if config.scale is None:
         raise InputError("these weights do not say how peptides' coordinates are scaled.")
     layout = resolved(chain_layout(scene), config.scale)
     fitted = fitted_atoms(scene)
     template_nm = scene.positions_nm - scene.positions_nm[fitted].mean(axis=0)
-    return ChainFeatures(
-        ChainCode(layout, config.scale), config.places(layout.types), template_nm, fitted,
+    return chains.ChainFeatures(
+        chains.ChainCode(layout, config.scale), config.places(layout.types), template_nm, fitted,
         stated_torsions(scene, layout), _least_distances(scene),
     )  # fmt: skip
 
@@ -350,41 +316,45 @@ def _least_distances(scene: Scene) -> torch.Tensor:
     return torch.from_numpy(least).float()
 
 
-def stated_torsions(scene: Scene, layout: ChainLayout) -> StatedTorsions:
+def stated_torsions(scene: Scene, layout: chains.ChainLayout) -> chains.StatedTorsions:
     """Return the torsions that have states: phi, psi, and in side chains those about bonds between tetrahedral atoms or
     from one to an aromatic ring, in the order in which they lie outwards, rotors (of methyl groups) among them; the
     side of its plane to which a saturated ring (of proline) is puckered; and, in the last place, the rotor of a free
     end's ammonium."""
     graph = bonded_graph(scene)
     ring = {int(i) for i in ring_bonds(scene).flatten()}
-    rows: list[tuple[list[int], int, int, Kind]] = []
+    rows: list[tuple[list[int], int, int, chains.Kind]] = []
     taken: dict[int, int] = {}
     for atom, near, next_, last in layout.turning:
         residue, names = int(scene.residue_of_atom[near]), tuple(scene.atom_names[i] for i in (atom, near, next_))
         if names[1:] == ("CA", "N"):
             if layout.types[residue] not in _FREE_PHI:
-                rows.append(([atom, near, next_, last], residue, 0, PHI))
+                rows.append(([atom, near, next_, last], residue, 0, chains.PHI))
         elif names == ("N", "C", "CA"):
             before_proline = layout.types[residue + 1 : residue + 2] == ("PRO",)
-            rows.append(([atom, near, next_, last], residue, 1, PSI_BEFORE_PROLINE if before_proline else PSI))
+            rows.append(
+                ([atom, near, next_, last], residue, 1, chains.PSI_BEFORE_PROLINE if before_proline else chains.PSI)
+            )
         elif not graph.has_edge(near, next_):
             # The pucker of a ring, on either side of its plane.
-            rows.append(([atom, near, next_, last], residue, FIRST_OF_SIDE_CHAIN, RING))
+            rows.append(([atom, near, next_, last], residue, chains.FIRST_OF_SIDE_CHAIN, chains.RING))
         elif names[1:] == ("N", "CA"):
             if layout.types[residue] not in _LONGEST:
-                rows.append(([atom, near, next_, last], residue, MOST_TORSIONS - 1, THREEFOLD))
+                rows.append(([atom, near, next_, last], residue, chains.MOST_TORSIONS - 1, chains.THREEFOLD))
         elif names[1] not in _BACKBONE:
             tetrahedral = all(graph.degree[i] == _TETRAHEDRAL.get(scene.elements[i]) for i in (near, next_))
-            slot = taken.get(residue, FIRST_OF_SIDE_CHAIN)
-            if (tetrahedral or (near in ring and atom in ring)) and slot < MOST_TORSIONS:
+            slot = taken.get(residue, chains.FIRST_OF_SIDE_CHAIN)
+            if (tetrahedral or (near in ring and atom in ring)) and slot < chains.MOST_TORSIONS:
                 taken[residue] = slot + 1
-                rows.append(([atom, near, next_, last], residue, slot, THREEFOLD if tetrahedral else RING))
-    return StatedTorsions.of(rows, len(layout.types))
+                rows.append(
+                    ([atom, near, next_, last], residue, slot, chains.THREEFOLD if tetrahedral else chains.RING)
+                )
+    return chains.StatedTorsions.of(rows, len(layout.types))
 
 
 def chain_scale(
-    frames: Iterable[tuple[ChainLayout, npt.NDArray[np.float32]]], known: ChainScale | None = None
-) -> ChainScale:
+    frames: Iterable[tuple[chains.ChainLayout, npt.NDArray[np.float32]]], known: chains.ChainScale | None = None
+) -> chains.ChainScale:
     """Measure stiff coordinates over frames `(n, n_atoms, 3)` nm of several peptides, each frame as much as any other.
 
     Lengths that vary by less than RIGID_NM are rigid: their deviation is 0. Residues of one type share slots. What is
@@ -398,11 +368,11 @@ def chain_scale(
     old = mean.keys() | slots.keys()
     for layout, x in frames:
         rows, closing, primary = torch.tensor(layout.placed), torch.tensor(layout.closing), torch.tensor(layout.primary)
-        values = internal_coordinates(torch.from_numpy(x).double(), layout.root, rows, closing, primary).numpy()
+        values = chains.internal_coordinates(torch.from_numpy(x).double(), layout.root, rows, closing, primary).numpy()
         for k, (key, kind) in enumerate(zip(layout.keys, layout.kinds, strict=True)):
             if key in old:
                 continue
-            if kind == TURNING:
+            if kind == chains.TURNING:
                 turning[key] = None
             else:
                 found.setdefault(key, []).append(values[:, k])
@@ -421,17 +391,17 @@ def chain_scale(
     # Torsions first, so that the backbone's stand in the same places for all residues; free ends last, since theirs are
     # at the same places of all.
     order = (*sorted(turning, key=_backbone_first), *sorted(k for k in found if deviation[k] > 0.0))
-    for key in sorted(order, key=lambda key: key.split()[0] in FREE_ENDS):
+    for key in sorted(order, key=lambda key: key.split()[0] in chains.FREE_ENDS):
         bearer, wanted = key.split()[0], 2 if key in turning else 1
-        if bearer in FREE_ENDS:
+        if bearer in chains.FREE_ENDS:
             start = 1 + max((slot for some in taken.values() for slot in some), default=-1)
         else:
-            full = taken.get(bearer, set()).union(*(taken.get(end, ()) for end in FREE_ENDS))
+            full = taken.get(bearer, set()).union(*(taken.get(end, ()) for end in chains.FREE_ENDS))
             start = next(k for k in itertools.count() if full.isdisjoint(range(k, k + wanted)))
         slots[key] = start
         taken.setdefault(bearer, set()).update(range(start, start + wanted))
     n_slots = 1 + max((slot for some in taken.values() for slot in some), default=-1)
-    return ChainScale(mean, deviation, slots, n_slots if known is None else max(n_slots, known.n_slots))
+    return chains.ChainScale(mean, deviation, slots, n_slots if known is None else max(n_slots, known.n_slots))
 
 
 def _backbone_first(key: str) -> tuple[int, str]:
@@ -440,24 +410,24 @@ def _backbone_first(key: str) -> tuple[int, str]:
     return {"CA": 0, "C": 1, "N+1": 2, "O": 2}.get(atom, 3), key
 
 
-def unknown_coordinates(layout: ChainLayout, scale: ChainScale) -> list[str]:
-    """Return the coordinates of a layout of which no data told."""
+def unknown_coordinates(layout: chains.ChainLayout, scale: chains.ChainScale) -> list[str]:
+    """Return the coordinates of a layout that no data show."""
     return [
         key
         for key, kind in zip(layout.keys, layout.kinds, strict=True)
-        if (key not in scale.slots if kind == TURNING else key not in scale.mean)
+        if (key not in scale.slots if kind == chains.TURNING else key not in scale.mean)
     ]
 
 
-def resolved(layout: ChainLayout, scale: ChainScale) -> ChainLayout:
-    """Return a layout that calls rigid what the data hold rigid. Raises InputError for coordinates no data tell of."""
+def resolved(layout: chains.ChainLayout, scale: chains.ChainScale) -> chains.ChainLayout:
+    """Return a layout that calls rigid what the data hold rigid. Raises InputError for coordinates no data show."""
     if unknown := unknown_coordinates(layout, scale):
         raise InputError(
             f"{len(unknown)} internal coordinates occur in no training molecule, the first is {unknown[0]!r}; train on "
             "a peptide that has this residue at such a place."
         )
     kinds = tuple(
-        RIGID if kind == STIFF and scale.deviation[key] == 0.0 else kind
+        chains.RIGID if kind == chains.STIFF and scale.deviation[key] == 0.0 else kind
         for key, kind in zip(layout.keys, layout.kinds, strict=True)
     )
     return replace(layout, kinds=kinds)

@@ -4,11 +4,9 @@ An entity's identifier is its residue's type, its neighbours' types and its plac
 internal coordinates of `models.peptides.chains`, so that no first stage is trained and nothing of an unseen sequence
 is lost. The flow runs on innovations: of each coordinate at time t after the conditioning frame, what its correlation
 with that frame leaves to learn, (z_t - ρ(t) z_0) / sqrt(1 - ρ(t)²), which has unit variance at any t. Each frame of a
-chunk has its own time, so that one model serves all spacings. The states of torsions with high barriers are drawn first
-(`models.peptides.torsion_states`); numbers of such a torsion count from the mean of those in its state. Frames that
-leave these states a little, or in which atoms overlap as they never do in MD, are set right by small turns
-(`models.peptides.chains`); chunks with frames where that is not enough are drawn again, in the same states and then
-in others.
+chunk has its own time, so that one model serves all spacings. The states of torsions with barriers are drawn first;
+their numbers count from the mean of those in their state. Frames that leave these states a little, or in which atoms
+overlap, are mended by small turns; chunks with frames where that is not enough are drawn again.
 """
 
 from __future__ import annotations
@@ -23,25 +21,183 @@ from torch.nn import functional as F
 
 from surrogate.models.lam_slide import flow
 from surrogate.models.layers import ParallelBlock, TimeEmbedding, rotary_angles
-from surrogate.models.peptides.chains import ChainFeatures, resolve_settings
-from surrogate.models.peptides.layout import ENDS, PeptideConfig, chain_features
-from surrogate.models.peptides.torsion_states import (
+from surrogate.models.peptides.chains import (
     MOST_STATES,
     MOST_TORSIONS,
-    StateJumps,
+    ChainFeatures,
     conditioning_states,
-    times_apart,
+    mended,
 )
+from surrogate.models.peptides.layout import ENDS, PeptideConfig, chain_features
 from surrogate.models.propagator import Chunk, Molecule, Propagator
 from systems.chemistry.geometry import superpose
 from systems.errors import InputError
 from systems.scene import Scene
 
-# More random numbers than a chunk's noise holds, from numbers in it that nothing else uses.
-# The conditioning frames' place in the noise (b, T, L, dim) is taken by their clean latents, so numbers of its first
-# frame are free: pairs of them seed generators, a row's from its own, so that no row depends on those beside it.
+# Which state each torsion with barriers is in, drawn before the flow draws the frames that go with it: a flow that
+# draws barrier crossings along with everything else leaks between states, since between two modes of noise there is
+# always some density, and a categorical draw does not. The flow is conditioned on the outcome, and frames that disobey
+# are drawn again.
 
-# Where the pair of numbers stands that seeds each use.
+_WIDTH = 96
+_WAVES = 8
+# Before training, a torsion changes to another state once in so many frames (in logits).
+_RARELY = -5.0
+# A step of training moves the probabilities by so many times as much as another parameter.
+_FAST = 10.0
+
+
+class StateJumps(nn.Module):
+    """The probabilities that torsions change their states between a frame and the next.
+
+    They follow from the residue's type, its numbers in the given frame, its states and its two neighbours' in that and
+    in the frame before, its own in the one before that, the new states of its torsions before this one (side chains
+    turn two torsions at once), and both times. Of neighbours' types only levels are learned, which add up: else the
+    network would know each pair of training by itself.
+    """
+
+    def __init__(self, n_slots: int, n_types: int) -> None:
+        super().__init__()
+        n_states = MOST_TORSIONS * MOST_STATES
+        self.of_numbers = nn.Linear(n_slots, _WIDTH, bias=False)
+        self.of_given = nn.ModuleList(nn.Linear(n_states, _WIDTH, bias=False) for _ in range(3))
+        self.of_before = nn.ModuleList(nn.Linear(n_states, _WIDTH, bias=False) for _ in range(3))
+        self.of_earlier = nn.Linear(n_states, _WIDTH, bias=False)
+        self.of_type = nn.Embedding(n_types, _WIDTH)
+        self.waves = nn.Buffer(math.pi * torch.linspace(0.25, 2.0, _WAVES), persistent=False)
+        self.of_times = nn.Linear(4 * _WAVES + 2, _WIDTH)
+        self.of_new = nn.ModuleList(nn.Linear(n_states, _WIDTH, bias=False) for _ in range(MOST_TORSIONS))
+        self.of_torsion = nn.Embedding(MOST_TORSIONS, _WIDTH)
+        self.hidden = nn.Linear(_WIDTH, _WIDTH)
+        self.logits = nn.Linear(_WIDTH, MOST_STATES)
+        # Of each type and torsion, from one state to another: a level, and a slope with the logarithm of time.
+        self.of_change = nn.Parameter(torch.zeros(2, n_types, MOST_TORSIONS, MOST_STATES, MOST_STATES))
+        # And a level of the residue before's type, and of the one after's: proline forbids what others allow.
+        self.beside_change = nn.Parameter(torch.zeros(2, n_types, MOST_TORSIONS, MOST_STATES, MOST_STATES))
+        nn.init.zeros_(self.logits.weight)
+        nn.init.constant_(self.logits.bias, _RARELY)
+
+    def of_known(self, known: Tensor, states: Tensor, places: Tensor, counts: Tensor) -> Tensor:
+        """What all frames of a chunk have in common: `known` (b, r, slots), its `states` (b, r, MOST_TORSIONS),
+        `places` (r, 3) -> (b, r, width)."""
+        beside = _beside(conditioning_states(states, counts))
+        h: Tensor = sum((of(x) for of, x in zip(self.of_given, beside, strict=True)), self.of_numbers(known.float()))
+        return h + self.of_type(places[:, 0])
+
+    def of_times_alone(
+        self, times_ps: Tensor, apart_ps: Tensor, places: Tensor, counts: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """Return what follows from frames' `times_ps` and `apart_ps` (b, t), after the given frame and after the one
+        before: `(b, t, width)`, and the levels of the probabilities `(b, t, MOST_TORSIONS, r, from, to)`."""
+        logs = torch.stack([times_ps, apart_ps], dim=-1).float().clamp(min=1e-3).log10()
+        angles = logs[..., None] * self.waves
+        waves = torch.cat([angles.sin(), angles.cos()], dim=-1).flatten(-2)
+        level, slope = (change[places[:, 0]].transpose(0, 1) for change in self.of_change)
+        for which, change in enumerate(self.beside_change):
+            level = level + _FAST * change[places[:, 1 + which]].transpose(0, 1)
+        absent = torch.arange(MOST_STATES, device=counts.device) >= counts.T[..., None, None].clamp(min=1)
+        levels = (level + slope * logs[..., 1, None, None, None, None]).masked_fill(absent, -torch.inf)
+        return self.of_times(torch.cat([waves, logs], dim=-1)), levels
+
+    def of_frames(self, conditioning: Tensor, earlier: Tensor) -> Tensor:
+        """`conditioning_states` of the frame before each, (b, t, r, n), and of the one before that, `earlier` -> (b, t,
+        r, width)."""
+        of_all = torch.cat([of.weight for of in (*self.of_before, self.of_earlier)], dim=1)
+        return F.linear(torch.cat([*_beside(conditioning), earlier], dim=-1), of_all)
+
+    def probabilities(self, torsion: int, h: Tensor, levels: Tensor, now: Tensor, conditioning: Tensor) -> Tensor:
+        """Return the logits `(b, t, r, MOST_STATES)` of the new state of one torsion of each residue.
+
+        `h` (b, t, r, width) is what `of_known`, `of_times_alone` and `of_frames` add up to, `levels` what
+        `of_times_alone` returns; `now` (b, t, r) the torsion's state in the frame before, `conditioning` (b, t, r, n)
+        the `conditioning_states` of the new frame, of which torsions before this one count.
+        """
+        n = torsion * MOST_STATES
+        of_new = cast(nn.Linear, self.of_new[torsion]).weight
+        h = F.silu(h + F.linear(conditioning[..., :n], of_new[:, :n], self.of_torsion.weight[torsion]))
+        at = now[..., None, None].expand(*now.shape, 1, MOST_STATES)
+        level = levels[:, :, torsion].expand(*now.shape, -1, -1).gather(-2, at)[..., 0, :]
+        # To stay has the logit zero.
+        return (self.logits(F.silu(self.hidden(h))) + level).scatter(-1, now[..., None], 0.0)
+
+    @torch.no_grad()
+    def raise_entries(self, of_type: Tensor, before: Tensor, after: Tensor) -> None:
+        """Add levels `(n_types,)` to the logits of entering phi > 0, of the residue's type and of its neighbours'."""
+        self.of_change[0, :, 0, 0, 1] += of_type
+        self.beside_change[0, :, 0, 0, 1] += before / _FAST
+        self.beside_change[1, :, 0, 0, 1] += after / _FAST
+
+    def loss(
+        self, known: Tensor, states: Tensor, places: Tensor, counts: Tensor, times_ps: Tensor, apart_ps: Tensor,
+        share: Tensor | None = None,
+    ) -> Tensor:  # fmt: skip
+        """Return the negative log-likelihood of what torsions did, per frame and torsion.
+
+        `known` (b, r, slots); `states` (b, 1 + t, r, MOST_TORSIONS), the given frame's first; `share` (b, r,
+        MOST_TORSIONS): what each torsion's change counts in a window, 1 where it is not given.
+        """
+        with torch.autocast(known.device.type, enabled=False):
+            before, new = states[:, :-1], states[:, 1:]
+            earlier = torch.cat([before[:, :1], before[:, :-1]], dim=1)
+            of_times, levels = self.of_times_alone(times_ps, apart_ps, places, counts)
+            h = self.of_frames(conditioning_states(before, counts), conditioning_states(earlier, counts))
+            h = h + of_times[:, :, None] + self.of_known(known, states[:, 0], places, counts)[:, None]
+            conditioning = conditioning_states(new, counts)
+            total = known.new_zeros(())
+            for torsion in torch.nonzero((counts > 0).any(0))[:, 0].tolist():
+                has = counts[:, torsion] > 0
+                logits = self.probabilities(torsion, h, levels, before[..., torsion], conditioning)[:, :, has]
+                chosen = new[..., has, torsion]
+                each = F.cross_entropy(logits.flatten(0, -2), chosen.flatten(), reduction="none").reshape(chosen.shape)
+                total = total + (each if share is None else share[:, None, has, torsion] * each).sum()
+            return total / (times_ps.numel() * max(1, int((counts > 0).sum())))
+
+    def draw(
+        self, known: Tensor, states: Tensor, places: Tensor, counts: Tensor, times_ps: Tensor, apart_ps: Tensor,
+        uniform: Tensor,
+    ) -> Tensor:  # fmt: skip
+        """Return states `(b, t, r, MOST_TORSIONS)` of new frames, from the given frame's numbers and `states`
+        (b, r, MOST_TORSIONS) and numbers `uniform` (b, t, r, MOST_TORSIONS) in [0, 1)."""
+        with torch.autocast(known.device.type, enabled=False):
+            of_times, levels = self.of_times_alone(times_ps, apart_ps, places, counts)
+            common = self.of_known(known, states, places, counts)[:, None] + of_times[:, :, None]
+            # A residue's torsion in each state, as `conditioning_states` has it.
+            ones = torch.eye(MOST_STATES, device=known.device) * (counts > 0)[..., None, None]
+            residues, most = torch.arange(len(counts), device=known.device), (counts - 1).clamp(min=0)
+            torsions = torch.nonzero((counts > 0).any(0))[:, 0].tolist()
+            now, found = states[:, None], []
+            before = conditioning = conditioning_states(now, counts)
+            for k in range(times_ps.shape[1]):
+                at = slice(k, k + 1)
+                h = self.of_frames(conditioning, before) + common[:, at]
+                new, before, conditioning = torch.zeros_like(now), conditioning, torch.zeros_like(conditioning)
+                for torsion in torsions:
+                    logits = self.probabilities(torsion, h, levels[:, at], now[..., torsion], conditioning)
+                    share = logits.softmax(-1).cumsum(-1)
+                    # Shares may end below one by rounding.
+                    drawn = (uniform[:, at, :, torsion, None] >= share[..., :-1]).sum(-1).minimum(most[:, torsion])
+                    new[..., torsion] = drawn
+                    own = slice(torsion * MOST_STATES, (torsion + 1) * MOST_STATES)
+                    conditioning[..., own] = ones[residues, torsion, drawn]
+                found.append(new)
+                now = new
+            return torch.cat(found, dim=1)
+
+
+def times_apart(times_ps: Tensor, forgotten_ps: float) -> Tensor:
+    """Return the time `(b, t)` between each frame and the one before it; frames of endless times know none before."""
+    before = torch.cat([torch.zeros_like(times_ps[:, :1]), times_ps[:, :-1]], dim=1)
+    return torch.where(times_ps >= forgotten_ps, times_ps, times_ps - before)
+
+
+def _beside(x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Return of residues `(..., r, n)` each itself, the one before it and the one after it."""
+    none = torch.zeros_like(x[..., :1, :])
+    return x, torch.cat([none, x[..., :-1, :]], -2), torch.cat([x[..., 1:, :], none], -2)
+
+
+# More random numbers than a chunk's noise holds: pairs of numbers of its first frame, which nothing else uses, seed
+# generators, a row's from its own. Where the pair stands that seeds each use:
 REDRAWS, STATES = 1, 5
 
 
@@ -115,8 +271,6 @@ class PeptideLayer(nn.Module):
 class PeptideFlow(nn.Module):
     """Data prediction: noisy innovations of a chunk, flow time, the given frame, each frame's time -> innovations."""
 
-    waves: Tensor
-
     def __init__(self, config: PeptideConfig, n_slots: int) -> None:
         super().__init__()
         c, n_types = config, len(config.types) + len(ENDS)
@@ -127,7 +281,7 @@ class PeptideFlow(nn.Module):
         self.of_given = nn.Parameter(torch.randn(c.width) * 0.02)
         self.of_states = TypedLinear(MOST_TORSIONS * MOST_STATES, c.width, n_types)
         n_waves = 16
-        self.register_buffer("waves", math.pi * torch.linspace(1.0 / _LONGEST_WAVE, 4.0, n_waves), persistent=False)
+        self.waves = nn.Buffer(math.pi * torch.linspace(1.0 / _LONGEST_WAVE, 4.0, n_waves), persistent=False)
         self.of_time = nn.Sequential(nn.Linear(2 * n_waves, c.width), nn.SiLU(), nn.Linear(c.width, c.width))
         self.embed_tau = TimeEmbedding(c.width)
         self.layers = nn.ModuleList(PeptideLayer(c.width, c.n_heads) for _ in range(c.n_layers))
@@ -139,7 +293,7 @@ class PeptideFlow(nn.Module):
             nn.init.zeros_(module.bias)
 
     def forward(self, o: Tensor, tau: Tensor, conditioning: Conditioning) -> Tensor:
-        """`o` (b, t, r, slots), `tau` (b,), or (1,) of all, `told` what the method of that name returns -> like `o`."""
+        """`o` (b, t, r, slots), `tau` (b,), or (1,) of all -> like `o`."""
         skip, out, scale_in = (flow.expand(v, o) for v in flow.preconditioning(tau, "linear"))
         return skip * o + out * self._network(o * scale_in, tau, conditioning)
 
@@ -163,10 +317,8 @@ class PeptideFlow(nn.Module):
         )
 
     def _network(self, o: Tensor, tau: Tensor, conditioning: Conditioning) -> Tensor:
-        h = (
-            torch.cat([conditioning.given, self.of_noisy(o, conditioning.types) + conditioning.of_frames], dim=1)
-            + conditioning.of_type
-        )
+        noisy = self.of_noisy(o, conditioning.types) + conditioning.of_frames
+        h = torch.cat([conditioning.given, noisy], dim=1) + conditioning.of_type
         time = F.silu(self.embed_tau(tau))
         modulation = self.modulation(time).unflatten(-1, (6, -1))
         h = h.transpose(1, 2)
@@ -194,9 +346,6 @@ class PeptideSlide(Propagator):
     arch: ClassVar[str] = "lam-slide-peptides"
     float32_layers: tuple[str, ...] = ("flow.of_time", "jumps")
     config: PeptideConfig
-    token_mean: Tensor
-    token_scale: Tensor
-    correlation: Tensor
 
     def __init__(self, config: PeptideConfig) -> None:
         super().__init__()
@@ -211,18 +360,14 @@ class PeptideSlide(Propagator):
         self.flow = PeptideFlow(config, n_slots)
         self.jumps = StateJumps(n_slots, n_types)
         self.lag_ps = config.shortest_ps
-        self.register_buffer("token_mean", torch.zeros(n_types, MOST_STATES, n_slots))
-        self.register_buffer("token_scale", torch.ones(n_types, n_slots))
-        self.register_buffer("correlation", torch.zeros(n_types, len(config.lags_ps), n_slots))
+        self.token_mean = nn.Buffer(torch.zeros(n_types, MOST_STATES, n_slots))
+        self.token_scale = nn.Buffer(torch.ones(n_types, n_slots))
+        self.correlation = nn.Buffer(torch.zeros(n_types, len(config.lags_ps), n_slots))
 
     def featurise(self, scene: Scene) -> Molecule:
         """See `Propagator.featurise`; `own`: the chain's `ChainFeatures`. Raises InputError for a scene that is no
         chain of residues that training saw."""
         return Molecule.of(scene, chain_features(scene, self.config))
-
-    @property
-    def n_conditioning(self) -> int:
-        return 1
 
     @property
     def n_new(self) -> int:
@@ -298,7 +443,7 @@ class PeptideSlide(Propagator):
 
     def next_chunk(self, last_frames_nm: Tensor, molecule: Molecule, noise: Tensor, *, solver_steps: int = 10,
                    solver: str | None = None, last_velocities_nm_ps: Tensor | None = None) -> Chunk:  # fmt: skip
-        """See `Propagator.next_chunk`. Raises InputError for a molecule not told as a chain."""
+        """See `Propagator.next_chunk`."""
         chain: ChainFeatures | None = molecule.own
         if chain is None:
             raise InputError("this model knows peptides by residues; make molecules by its `featurise`.")
@@ -333,7 +478,7 @@ class PeptideSlide(Propagator):
 
             y = flow.SOLVERS[solver or self.solvers[0]](predict, drawn, solver_steps, "linear")
             tokens = self._tokens(self.from_innovations(y, known[rows], times[rows], types), states[rows], chain)
-            resolved = resolve_settings(tokens.flatten(0, 1), states[rows].flatten(0, 1), chain)
+            resolved = mended(tokens.flatten(0, 1), states[rows].flatten(0, 1), chain)
             frames, astray, crowded = (x.unflatten(0, tokens.shape[:2]) for x in resolved)
             return self._laid(frames, chain), astray.any(-1), crowded.any(-1)
 

@@ -6,17 +6,17 @@ import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import cast
 
 import numpy as np
 import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from surrogate.data.frames import TrainingFrames
-from surrogate.models.peptides.chains import ChainFeatures
+from surrogate.data import TrainingFrames
+from surrogate.models.peptides.chains import FIRST_OF_SIDE_CHAIN, MOST_TORSIONS, ChainFeatures
 from surrogate.models.peptides.layout import PeptideConfig
 from surrogate.models.peptides.model import PeptideSlide
-from surrogate.models.peptides.torsion_states import FIRST_OF_SIDE_CHAIN, MOST_TORSIONS
 from systems.errors import InputError
 
 # Weights that turn frames of short runs from chosen starts into equilibrium, by a reversible Markov model.
@@ -51,11 +51,9 @@ def equilibrium_weights(
 
     Where hardly any run goes between two states, a Markov model would put all weight into one that by chance was
     entered and not left. So each run is taken to begin and to end with a jump between any two frames, late frames
-    (relaxed ones) more likely: what transitions do not tell is left as the runs show it.
-
-    Where runs leave a rare state and none enters it, they do not tell how rare it is. What is known otherwise (from
-    metadynamics) is given by `states` (n_frames,), the state of each frame, and `shares` (n_states,), their
-    populations, which need no norm: within each state the Markov model weighs frames, between them the shares do.
+    (relaxed ones) more likely. Populations that are known otherwise (from metadynamics) are given by `states`
+    (n_frames,), the state of each frame, and `shares` (n_states,), which need no norm: within each state the Markov
+    model weighs frames, between them the shares do.
 
     TICA, k-means and the reversible maximum-likelihood model of transition counts (Trendelkamp-Schroer et al., J. Chem.
     Phys. 143, 174101 (2015)) are deeptime's.
@@ -140,7 +138,7 @@ class PeptideSubject:
 
     frames: TrainingFrames
     chain: ChainFeatures
-    weights: npt.NDArray[np.float64] | None = None
+    weights: FloatArray | None = None
 
     def in_equilibrium(self, positive_phi_kt: Mapping[str, float]) -> PeptideSubject:
         """Return this subject with weights, or itself where its runs do not tell how likely its states are."""
@@ -157,9 +155,7 @@ class PeptideSubject:
         weights[kept] = found
         return replace(self, weights=weights)
 
-    def _signs_of_phi(
-        self, kept: npt.NDArray[np.int64], positive_phi_kt: Mapping[str, float]
-    ) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.float64]]:
+    def _signs_of_phi(self, kept: IntArray, positive_phi_kt: Mapping[str, float]) -> tuple[IntArray, FloatArray]:
         """Return the pattern of phi's signs of each frame `kept` (n,), as a number, and the population of each pattern.
 
         Residues are taken to be independent; those whose free energy is not given play no part, nor do those before a
@@ -186,7 +182,7 @@ class PeptideSubject:
     def _frames(self, low: int, high: int) -> Tensor:
         return torch.from_numpy(self.frames.positions_nm(np.arange(low, high))).to(self.chain.places.device)
 
-    def _torsions(self, low: int, high: int) -> npt.NDArray[np.float64]:
+    def _torsions(self, low: int, high: int) -> FloatArray:
         """Return cosines and sines `(n, 2 n_torsions)` of frames."""
         at = self.chain.code.turning_at
         found = []
@@ -204,12 +200,10 @@ class PeptideSubject:
 
         Times are evenly spaced at a lag drawn evenly in its logarithm, or drawn one by one in the same way; none is
         longer than the configuration's, and all frames of a window are of one stretch. With weights half of them are
-        read backwards, and in some the later frames are any of equilibrium, `forgotten_ps` after the first.
-
-        Runs from chosen starts tell well what happens to states that they hold more often than equilibrium does, and
-        detailed balance tells the rest: windows start from the former as they are read forwards, from the latter
-        backwards. (From a common state, runs forwards show rare ones hardly entered; averaged with windows that do
-        enter them, they would halve the rate.)
+        read backwards, and in some the later frames are any of equilibrium, `forgotten_ps` after the first: windows
+        start from states that runs hold more often than equilibrium does as they are read forwards, from others
+        backwards. (From a common state runs hardly enter rare ones; averaged with windows that do, they would halve the
+        rate.)
         """
         lag = self.frames.lag_ps
         ranges = np.array(self.frames.split.ranges(self.frames.starts, validation=validation))
@@ -245,7 +239,7 @@ class PeptideSubject:
         idx[:, 1:] = torch.where(forgotten, anywhere, idx[:, 1:])
         return idx, torch.where(forgotten, config.forgotten_ps, times)
 
-    def _starts(self, span: npt.NDArray[np.int64], ranges: npt.NDArray[np.int64], generator: torch.Generator) -> Tensor:
+    def _starts(self, span: IntArray, ranges: IntArray, generator: torch.Generator) -> Tensor:
         """Draw first frames `(n,)` of windows that reach `span` (n,) frames further, each as likely as any other."""
         rooms = np.maximum(np.diff(ranges, axis=1) - span, 0).cumsum(axis=0)
         place = torch.rand(len(span), generator=generator, dtype=torch.float64).numpy()
@@ -254,9 +248,7 @@ class PeptideSubject:
         before = np.where(which > 0, rooms[which - 1, np.arange(len(span))], 0)
         return torch.from_numpy(ranges[which, 0] + at - before)
 
-    def _likely_starts(
-        self, span: npt.NDArray[np.int64], ranges: npt.NDArray[np.int64], generator: torch.Generator
-    ) -> tuple[Tensor, Tensor]:
+    def _likely_starts(self, span: IntArray, ranges: IntArray, generator: torch.Generator) -> tuple[Tensor, Tensor]:
         """Draw first frames `(n,)` by their weights, of windows that end where runs are less often than equilibrium;
         False `(n,)` where none was met."""
         assert self.weights is not None
@@ -276,7 +268,7 @@ class PeptideSubject:
     @cached_property
     def _likely_from(
         self,
-    ) -> tuple[npt.NDArray[np.float64], list[npt.NDArray[np.int64]], list[npt.NDArray[np.int64]]]:
+    ) -> tuple[FloatArray, list[IntArray], list[IntArray]]:
         """Return the sums of weights of groups of frames alike, each group's frames, and how many follow each in its
         run, the most first.
 
@@ -299,9 +291,8 @@ class PeptideSubject:
         return torch.from_numpy(np.searchsorted(self._cumulative, place * self._cumulative[-1], side="right"))
 
     @cached_property
-    def _cumulative(self) -> npt.NDArray[np.float64]:
-        assert self.weights is not None
-        return np.cumsum(self.weights)
+    def _cumulative(self) -> FloatArray:
+        return np.cumsum(cast(FloatArray, self.weights))
 
     def batch(self, n: int, config: PeptideConfig, generator: torch.Generator) -> tuple[Tensor, Tensor]:
         """Draw windows as a flow sees them: half of the batches of whole chunks, the others of fewer frames.
@@ -336,9 +327,8 @@ class PeptideSubject:
             crossings = kinds[row % len(kinds)]
             first = crossings[(draws[0] * len(crossings)).astype(np.int64)] - (draws[1] * span).astype(np.int64)
             which = np.searchsorted(ranges[:, 0], first, side="right") - 1
-            fits = (
-                (first >= ranges[which.clip(min=0), 0]) & (first + span < ranges[which.clip(min=0), 1]) & (which >= 0)
-            )
+            low, high = ranges[which.clip(min=0)].T
+            fits = (first >= low) & (first + span < high) & (which >= 0)
             if bool(backwards[row]):
                 fits &= draws[2] < relative[first.clip(min=0)]
             if fits.any():
@@ -348,7 +338,7 @@ class PeptideSubject:
         return idx, times
 
     @cached_property
-    def _crossings(self) -> tuple[list[npt.NDArray[np.int64]], npt.NDArray[np.float64]]:
+    def _crossings(self) -> tuple[list[IntArray], FloatArray]:
         """Return the frames after which some phi changes its state, and those after which a side chain does, where
         there are any; and how likely each frame `(n_frames,)` is to be kept so that those of one pattern of phi are as
         in equilibrium, the likeliest (but for a few) always."""
@@ -367,7 +357,7 @@ class PeptideSubject:
                     relative[inside] = self.weights[inside] / np.quantile(kept, _LIKELIEST)
         return [some for some in kinds if len(some)], relative
 
-    def _rare_torsions(self) -> list[tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]]:
+    def _rare_torsions(self) -> list[tuple[IntArray, IntArray]]:
         """Return residues and slots of phi, and those of heavy side chains: psi and rotors turn often enough."""
         stated = self.chain.stated.to(torch.device("cpu"))
         residue, slot = stated.residue.numpy(), stated.slot.numpy()
@@ -396,11 +386,9 @@ def _distinct(ahead: Tensor, longest: int) -> Tensor:
 
 
 # Windows from which the probabilities of changes of states are learned: what is rare is drawn more often than it
-# occurs. What a torsion in a rare state does next may be learned from as many windows as there are: its probabilities
-# are conditional on the state that it starts from, however often windows start there. Changes that are rare themselves
-# may be drawn more often, too, if each then counts less in the loss, in proportion, and so may windows chosen for
-# another torsion's sake: the loss stays what it was, but no longer rests on the few batches that happen to hold such a
-# change.
+# occurs. Rare starts may be, since probabilities are conditional on the state that a torsion starts from; rare changes,
+# and windows chosen for another torsion's sake, if each then counts less in the loss, in proportion: the loss stays
+# what it was, but no longer rests on the few batches that happen to hold such a change.
 
 _POOL = 16_384
 # Changes are to be in this share of the windows that could hold them; nothing is drawn more than so much too often.

@@ -14,21 +14,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from surrogate.data.frames import TrainingFrames
-from surrogate.data.references import FrameSets, References, Survey
-from surrogate.models.architecture import (
-    AdvanceFn,
-    Architecture,
-    Choice,
-    Prepared,
-    Settings,
-    Suitability,
-    Trainer,
-    TrainingRequest,
-)
+from surrogate.data import FrameSets, References, Survey, TrainingFrames
+from surrogate.models import architecture as arch
 from surrogate.models.lam_slide import flow
-from surrogate.models.lam_slide.trainer import TAU_MAX, pick
-from surrogate.models.peptides.chains import FREE_ENDS, ChainFeatures, dihedral
+from surrogate.models.lam_slide.trainer import REVERSIBLE, TAU_MAX, pick
+from surrogate.models.peptides import chains
 from surrogate.models.peptides.layout import (
     ENDS,
     PeptideConfig,
@@ -38,33 +28,25 @@ from surrogate.models.peptides.layout import (
     standard_peptide,
     unknown_coordinates,
 )
-from surrogate.models.peptides.model import PeptideSlide
+from surrogate.models.peptides.model import PeptideSlide, times_apart
 from surrogate.models.peptides.subjects import PeptideSubject, StateWindows
-from surrogate.models.peptides.torsion_states import (
-    MOST_STATES,
-    NEGATIVE_CORE_DEG,
-    POSITIVE_CORE_DEG,
-    conditioning_states,
-    times_apart,
-)
 from surrogate.models.weights import Weights, load_weights, provenance_of, read_header, save_weights, training_domain
 from surrogate.training.loop import ProgressFn, Stage, StageConfig, train_stages
 from systems.errors import InputError
 
 # The probabilities of entering phi > 0, set to those of leaving it and to how likely it is. Runs from chosen starts
-# show hundreds of exits from phi > 0 and hardly an entry. Read backwards, exits are entries, but only as well weighted
-# as a few frames are, and a rate that is three times too high shows in no loss: nearly every window holds no entry.
+# show hundreds of exits from phi > 0 and hardly an entry, and a rate that is three times too high shows in no loss.
 # What is known well are the probabilities of leaving and the free energy of phi > 0 (umbrella sampling), and in
 # equilibrium as many frames enter as leave. So after training the probabilities of entering are moved, by a level of
 # each residue's type and of its neighbours', to where this holds in the mean over the frames of all training peptides.
 
-# Frames of either side by which probabilities are told, drawn anew by this seed, and how long after them.
+# Frames of either side at which probabilities are read, drawn anew by this seed, and how long after them.
 _SIDE_FRAMES, _SIDE_SEED = 1000, 0
 _TIMES_PS = (3.0, 10.0, 30.0, 100.0)
 # Of a side that fewer frames show, nothing is said.
 _LEAST_FRAMES = 50
 _PASSES = 4
-# Holds levels that few peptides tell near zero, and what one phi may ask for within bounds.
+# Holds levels that few peptides show near zero, and what one phi may ask for within bounds.
 _RIDGE, _MOST = 0.3, 3.0
 
 
@@ -74,10 +56,10 @@ class Phi:
     n_residues, n_slots) and `states` (n, n_residues, MOST_TORSIONS) each, and how likely the positive is beside the
     other."""
 
-    chain: ChainFeatures
+    chain: chains.ChainFeatures
     residue: int
-    known: tuple[Tensor, Tensor]
-    states: tuple[Tensor, Tensor]
+    known: tuple[Tensor, ...]
+    states: tuple[Tensor, ...]
     positive: float
 
     @property
@@ -91,7 +73,7 @@ def balance_entries(model: PeptideSlide, subjects: Sequence[PeptideSubject]) -> 
     """Move the probabilities of entering phi > 0 of `model` to where detailed balance holds in the mean over
     `subjects`, whose weights say how likely phi > 0 is; those without weights play no part."""
     n_types = len(model.token_mean)
-    phis = [phi for subject in subjects for phi in told_phis(model, subject)]
+    phis = [phi for subject in subjects for phi in weighted_phis(model, subject)]
     if not phis:
         return
     conditioning = torch.zeros(len(phis), 3 * n_types, dtype=torch.float64)
@@ -105,22 +87,18 @@ def balance_entries(model: PeptideSlide, subjects: Sequence[PeptideSubject]) -> 
         model.jumps.raise_entries(*levels.float().to(model.token_mean.device).chunk(3))
 
 
-def told_phis(model: PeptideSlide, subject: PeptideSubject) -> list[Phi]:
-    """Return each phi of a peptide of which frames show both sides and weights tell how likely they are; before a
+def weighted_phis(model: PeptideSlide, subject: PeptideSubject) -> list[Phi]:
+    """Return each phi of a peptide of which frames show both sides and weights say how likely they are; before a
     proline that is not known well enough."""
     if subject.weights is None:
         return []
     chain, found = subject.chain, []
     types = (*chain.code.layout.types, "")
     for residue in chain.signed.tolist():
-        if types[residue + 1] == "PRO":
-            continue
         sides = [_side(subject, residue, state) for state in (0, 1)]
-        if min(len(idx) for idx, _ in sides) < _LEAST_FRAMES:
-            continue
-        (known, states), (known_positive, states_positive) = (subject.seen(model, idx) for idx, _ in sides)
-        both, all_states = (known, known_positive), (states, states_positive)
-        found.append(Phi(chain, residue, both, all_states, sides[1][1] / sides[0][1]))
+        if types[residue + 1] != "PRO" and min(len(idx) for idx, _ in sides) >= _LEAST_FRAMES:
+            known, states = zip(*(subject.seen(model, idx) for idx, _ in sides), strict=True)
+            found.append(Phi(chain, residue, known, states, sides[1][1] / sides[0][1]))
     return found
 
 
@@ -147,8 +125,8 @@ def _side(subject: PeptideSubject, residue: int, state: int) -> tuple[Tensor, fl
     stated = subject.chain.stated.to(torch.device("cpu"))
     quad = stated.quads[(stated.residue == residue) & (stated.slot == 0)][0]
     x = torch.from_numpy(subject.frames.positions_nm(drawn.numpy()))
-    phi = dihedral(*(x[:, int(atom)] for atom in quad)).rad2deg()
-    low, high = (NEGATIVE_CORE_DEG, POSITIVE_CORE_DEG)[state]
+    phi = chains.dihedral(*(x[:, int(atom)] for atom in quad)).rad2deg()
+    low, high = (chains.NEGATIVE_CORE_DEG, chains.POSITIVE_CORE_DEG)[state]
     return drawn[(phi > low) & (phi < high)], total
 
 
@@ -157,7 +135,7 @@ def _log_probabilities(model: PeptideSlide, phi: Phi, state: int) -> Tensor:
     later."""
     known, now, chain = phi.known[state], phi.states[state], phi.chain
     counts, before, found = chain.stated.counts, now[:, None], []
-    conditioning = conditioning_states(before, counts)
+    conditioning = chains.conditioning_states(before, counts)
     common = model.jumps.of_known(known, now, chain.places, counts)[:, None] + model.jumps.of_frames(
         conditioning, conditioning
     )
@@ -218,10 +196,8 @@ def train_peptides(
     resume: bool = False,
     progress: ProgressFn | None = None,
 ) -> Path:
-    """Train on frames of several sequences and write `out` (.safetensors); beside it a CSV of the curves.
-
-    First the flow, told what states torsions are in, then the probabilities of these states, which share nothing with
-    it.
+    """Train on frames of several sequences and write `out` (.safetensors); beside it a CSV of the curves: first the
+    flow, conditioned on the states of torsions, then the probabilities of these states, which share nothing with it.
 
     `unseen`: sequences held out whole, whose loss the curves show. `start`: weights to go on from, with their scales.
     Every frame of `sets` outside the split is trained on; windows start anywhere. Raises InputError for scenes that are
@@ -230,7 +206,7 @@ def train_peptides(
     out = Path(out)
     torch.manual_seed(training.seed)
     if start is not None:
-        # Learning further, a flow forgets the few steps that it was taught to end in.
+        # Trained further, a flow forgets the few steps that it was distilled to.
         config = replace(start.model.config, usual_steps=config.usual_steps, usual_solver=config.usual_solver)
     config = with_scale(config, sets)
     device = torch.device(training.device)
@@ -287,15 +263,14 @@ def train_peptides(
                 terms = {"jumps": loss}
             else:
                 with torch.autocast(device.type, dtype=torch.bfloat16, enabled=stage.bf16):
-                    terms = peptide_loss(
-                        model, subject.chain, numbers, states, times.to(device), generator, noisy=False
-                    )[1]
+                    given = (numbers, states, times.to(device), generator)
+                    terms = peptide_loss(model, subject.chain, *given, noisy=False)[1]
             for key, value in terms.items():
                 found.setdefault(f"{name}_{key}", []).append(float(value))
         return {key: float(np.mean(values)) for key, values in found.items()}
 
     domains = [training_domain(f, strides=_strides(config, f)) for f in sets]
-    # One molecule tells nothing of others, whatever the weights knew that it was trained from.
+    # One molecule says nothing of others, whatever the weights covered that it was trained from.
     several = len({f.scene.topology_hash for f in sets}) > 1
     domain = replace(domains[0], further=tuple(domains[1:]), transferable=several)
 
@@ -361,7 +336,7 @@ def _places(config: PeptideConfig, key: str) -> tuple[slice, EllipsisType, slice
     assert config.scale is not None
     slot, kind = config.scale.slots[key], key.split()[0]
     types = slice(None)
-    if kind not in FREE_ENDS:
+    if kind not in chains.FREE_ENDS:
         at = (*ENDS, *config.types).index(kind)
         types = slice(at, at + 1)
     return types, ..., slice(slot, slot + (1 if key in config.scale.mean else 2))
@@ -376,12 +351,12 @@ def normalise(model: PeptideSlide, subjects: Sequence[PeptideSubject], seed: int
     """
     assert model.config.scale is not None
     slots = model.config.scale.slots
-    of_ends = [_places(model.config, key) for key in slots if key.split()[0] in FREE_ENDS]
+    of_ends = [_places(model.config, key) for key in slots if key.split()[0] in chains.FREE_ENDS]
     of_turning = [_places(model.config, key) for key in slots if key not in model.config.scale.mean]
     rng = np.random.default_rng(seed)
     lags = model.config.lags_ps
     n_types, _, n_slots = model.token_mean.shape
-    sums = torch.zeros(3, n_types, MOST_STATES, n_slots, dtype=torch.float64)
+    sums = torch.zeros(3, n_types, chains.MOST_STATES, n_slots, dtype=torch.float64)
     for subject in subjects:
         _count_middles(sums, subject)
         frames = torch.from_numpy(subject.frames.some_nm(_MEASURED_FRAMES // len(subjects) + _LEAST_MEASURED))
@@ -389,7 +364,7 @@ def normalise(model: PeptideSlide, subjects: Sequence[PeptideSubject], seed: int
         at = subject.chain.state_at
         own = torch.where(at < 0, 0, states.gather(-1, at.clamp(min=0).expand(len(states), -1, -1)))
         for r, kind in enumerate(subject.chain.places[:, 0].tolist()):
-            for state in range(MOST_STATES):
+            for state in range(chains.MOST_STATES):
                 inside = (own[:, r] == state) & subject.chain.code.filled[r]
                 for power in range(3):
                     sums[power, kind, state] += (tokens[:, r].pow(power) * inside).sum(0)
@@ -436,7 +411,7 @@ def _count_middles(sums: Tensor, subject: PeptideSubject) -> None:
 
 
 def peptide_loss(
-    model: PeptideSlide, chain: ChainFeatures, numbers: Tensor, states: Tensor, times_ps: Tensor,
+    model: PeptideSlide, chain: chains.ChainFeatures, numbers: Tensor, states: Tensor, times_ps: Tensor,
     generator: torch.Generator, *, noisy: bool = True,
 ) -> tuple[Tensor, dict[str, Tensor]]:  # fmt: skip
     """Flow matching on the innovations of windows: `numbers` (b, 1 + t, r, slots) and `states` (b, 1 + t, r,
@@ -455,7 +430,7 @@ def peptide_loss(
     noise = torch.randn(target.shape, generator=generator).to(numbers.device) * filled
     alpha, sigma, _, _ = (flow.expand(v, target) for v in flow.coefficients(tau, "linear"))
     conditioning = model.flow.conditioning(
-        known, times_ps, chain.places, conditioning_states(states, chain.stated.counts)
+        known, times_ps, chain.places, chains.conditioning_states(states, chain.stated.counts)
     )
     found = model.flow(alpha * target + sigma * noise, tau, conditioning)
     weight = flow.expand(flow.preconditioning(tau, "linear")[1].square().reciprocal(), target)
@@ -463,7 +438,7 @@ def peptide_loss(
     return loss, {"flow": loss.detach(), "turning": turning.detach(), "stiff": stiff.detach()}
 
 
-def by_kind(error: Tensor, chain: ChainFeatures, config: PeptideConfig) -> tuple[Tensor, Tensor, Tensor]:
+def by_kind(error: Tensor, chain: chains.ChainFeatures, config: PeptideConfig) -> tuple[Tensor, Tensor, Tensor]:
     """Return the mean of squared errors `(b, t, r, slots)` in which torsions count more, that of torsions alone, and
     that of stiff numbers."""
     filled = chain.code.filled
@@ -476,7 +451,7 @@ def by_kind(error: Tensor, chain: ChainFeatures, config: PeptideConfig) -> tuple
 
 
 def state_loss(
-    model: PeptideSlide, chain: ChainFeatures, known: Tensor, states: Tensor, times_ps: Tensor,
+    model: PeptideSlide, chain: chains.ChainFeatures, known: Tensor, states: Tensor, times_ps: Tensor,
     generator: torch.Generator, *, noisy: bool = True, share: Tensor | None = None,
 ) -> Tensor:  # fmt: skip
     """Return the negative log-likelihood of the changes of states: `known` (b, r, slots) the given frame's numbers,
@@ -488,69 +463,60 @@ def state_loss(
     return model.jumps.loss(known, states, chain.places, chain.stated.counts, times_ps, apart, share)
 
 
-def disturbed(known: Tensor, chain: ChainFeatures, config: PeptideConfig, generator: torch.Generator) -> Tensor:
+def disturbed(known: Tensor, chain: chains.ChainFeatures, config: PeptideConfig, generator: torch.Generator) -> Tensor:
     """Return the given frame's numbers `(b, r, slots)` with the noise that training adds."""
     noise = torch.randn(known.shape, generator=generator).to(known.device)
     return known + config.conditioning_noise * chain.code.filled * noise
 
 
-# The model of peptides behind the verb `train`: choices for the references, settings, and the start.
-
 # Share of the longest trajectory that a window may span: its end is held out.
 _SPAN = 0.9
 
 
-class PeptideTrainer(Trainer):
+class PeptideTrainer(arch.Trainer):
     """One flow for peptides of any sequence and any spacing of frames."""
 
     goes_on = True
     learns_lags = True
 
-    def choose(self, references: References, request: TrainingRequest) -> tuple[Choice, ...]:
+    def choose(self, references: References, request: arch.TrainingRequest) -> tuple[arch.Choice, ...]:
         """See `Trainer.choose`."""
         survey, known = references.survey, PeptideConfig()
         found = []
         going_on = request.start_from is not None
         if not going_on and "shortest_ps" not in request.model and survey.lag_ps != known.shortest_ps:
-            found.append(Choice("model.shortest_ps", survey.lag_ps, "the references' spacing of frames"))
+            found.append(arch.Choice("model.shortest_ps", survey.lag_ps, "the references' spacing of frames"))
         if not going_on and "longest_ps" not in request.model:
             reach = int(_SPAN * min(survey.longest)) * survey.lag_ps
             if request.longest_lag_ps is not None:
-                found.append(Choice("model.longest_ps", request.longest_lag_ps, "`longest_lag_ps`"))
+                found.append(arch.Choice("model.longest_ps", request.longest_lag_ps, "`longest_lag_ps`"))
             elif reach < known.longest_ps:
-                found.append(Choice("model.longest_ps", reach, "as far as every reference reaches"))
+                found.append(arch.Choice("model.longest_ps", reach, "as far as every reference reaches"))
         if "time_reversal" not in request.training and survey.equilibrium:
-            found.append(Choice("training.time_reversal", True, "MD at constant temperature reads alike backwards"))
+            found.append(REVERSIBLE)
         return tuple(found)
 
-    def settings(self, request: TrainingRequest) -> Settings:
+    def settings(self, request: arch.TrainingRequest) -> arch.Settings:
         """See `Trainer.settings`."""
-        asked = {"budget_s": request.budget_s, "steps": request.steps, "seed": request.seed, "device": request.device}
-        training = request.settings(PeptideTraining, asked)
         model = request.model if request.start_from is None else read_header(request.start_from).config
-        if request.start_from is not None:  # learning further, a flow forgets the few steps that it was taught
+        if request.start_from is not None:  # trained further, a flow forgets the few steps that it was distilled to
             model = {key: value for key, value in model.items() if key not in ("usual_steps", "usual_solver")}
-        return Settings(PeptideConfig.from_dict(model), training, frozenset(asked))
+        return arch.Settings(PeptideConfig.from_dict(model), request.settings(PeptideTraining), arch.RESOLVED)
 
-    def prepare(self, references: References, request: TrainingRequest) -> Prepared:
+    def prepare(self, references: References, request: arch.TrainingRequest) -> arch.Prepared:
         """See `Trainer.prepare`."""
         settings, sets = self.settings(request), references.sets()
         start = None if request.start_from is None else load_weights(request.start_from)
 
-        def report(advance: AdvanceFn, stage: str, share: float, metrics: dict[str, float]) -> None:
-            done = 1 - JUMPS_SHARE if stage == "jumps" else 0.0
-            advance(stage, done + share * (JUMPS_SHARE if stage == "jumps" else 1 - JUMPS_SHARE))
+        def run(advance: arch.AdvanceFn) -> Path:
+            def report(stage: str, share: float, metrics: dict[str, float]) -> None:
+                advance(stage, share * (1 - JUMPS_SHARE) if stage == "flow" else 1 - JUMPS_SHARE * (1 - share))
 
-        def run(advance: AdvanceFn) -> Path:
-            trained, unseen = (
-                [_under_standard_names(frames) for frames in some] for some in (sets.trained, sets.unseen)
-            )
-            return train_peptides(
-                trained, request.out, settings.model, settings.training, unseen=unseen, start=start,
-                resume=request.resume, progress=partial(report, advance),
-            )  # fmt: skip
+            trained, unseen = (list(map(_under_standard_names, some)) for some in (sets.trained, sets.unseen))
+            return train_peptides(trained, request.out, settings.model, settings.training, unseen=unseen, start=start,
+                                  resume=request.resume, progress=report)  # fmt: skip
 
-        return Prepared(sets.names, run)
+        return arch.Prepared(sets.names, run)
 
 
 def _under_standard_names(frames: TrainingFrames) -> TrainingFrames:
@@ -564,7 +530,7 @@ def _under_standard_names(frames: TrainingFrames) -> TrainingFrames:
     )  # fmt: skip
 
 
-def _suits(survey: Survey) -> Suitability | None:
+def _suits(survey: Survey) -> arch.Suitability | None:
     if len(survey.scenes) < 2:
         return None
     try:
@@ -572,7 +538,7 @@ def _suits(survey: Survey) -> Suitability | None:
             chain_layout(scene)
     except InputError:
         return None
-    return Suitability(10, f"{len(survey.scenes)} peptides, known by their residues in internal coordinates")
+    return arch.Suitability(10, f"{len(survey.scenes)} peptides, known by their residues in internal coordinates")
 
 
-PEPTIDES = Architecture("lam-slide-peptides", PeptideConfig.from_dict, PeptideSlide, PeptideTrainer, _suits)
+PEPTIDES = arch.Architecture("lam-slide-peptides", PeptideConfig.from_dict, PeptideSlide, PeptideTrainer, _suits)

@@ -168,7 +168,7 @@ def by_openmm(rates: Rates, scene: Scene, config: MDConfig, why: str) -> Rates:
 
 def rollout_rate(scene: Scene, weights: Weights, temperature_k: float, stretch: float, cores: int) -> Rolls:
     """Return how weights roll a scene that they cover, by a few chunks of it; `stretch`, `cores`: see `Rates`."""
-    from surrogate.data.shipped import shipped_weights
+    from surrogate.models.architecture import shipped_weights
     from surrogate.models.potential import Potential
     from surrogate.sampling.domain import in_bath
     from surrogate.sampling.runner import RolloutConfig, rollout
@@ -216,7 +216,7 @@ def _slowest_ps(files: list[Path]) -> float:
 
 def _covering(scene: Scene, config: MDConfig, named: str | Path | None) -> tuple[Weights | None, str]:
     """Return the weights that cover the scene under these conditions, and why these or why none."""
-    from surrogate.data.shipped import weights_path
+    from surrogate.models.architecture import weights_path
     from surrogate.models.weights import load_weights
     from surrogate.sampling.domain import check_conditions, choose_weights, match_domain
 

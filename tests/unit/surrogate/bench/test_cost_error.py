@@ -27,7 +27,7 @@ from surrogate.bench.cost_error.sweep import run_cost_error
 from surrogate.bench.cost_error.sweep_settings import CostErrorConfig, Setting, Sweep, choose_settings
 from surrogate.bench.held_out import refuse_trained_on
 from surrogate.cli import main
-from surrogate.data.shipped import weights_path
+from surrogate.models.architecture import weights_path
 from surrogate.models.weights import Weights, load_weights, save_weights
 from systems.errors import InputError
 from systems.scene import Scene

@@ -17,7 +17,7 @@ from surrogate.bench.cost_error.effective_samples import (
     slowest_torsion,
     training_cost,
 )
-from surrogate.data.shipped import weights_path
+from surrogate.models.architecture import weights_path
 from surrogate.models.weights import load_weights
 
 

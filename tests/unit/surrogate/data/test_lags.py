@@ -9,14 +9,13 @@ import numpy as np
 import pytest
 import torch
 
-from surrogate.data.frames import TrainingFrames
-from surrogate.data.references import StrideSampler, strides_up_to
-from surrogate.models.lam_slide.network import LamSlideConfig
+from surrogate.data import StrideSampler, TrainingFrames, strides_up_to
+from surrogate.models.lam_slide.model import LamSlideConfig
 from surrogate.models.lam_slide.trainer import TrainingConfig, train_lam_slide, window_frames
 from surrogate.models.weights import Weights, load_weights, save_weights
 from surrogate.sampling.domain import choose_lag, fit_weights
-from surrogate.sampling.openmm.simulation import Simulation
 from surrogate.sampling.runner import RolloutConfig, rollout
+from surrogate.sampling.simulation import Simulation
 from systems.errors import InputError
 from systems.scene import Scene
 from systems.trajectory.codec import open_trajectory

@@ -9,8 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from surrogate.data.frames import collect_frames, in_standard_pose
-from surrogate.data.references import FrameSets, collect_sets
+from surrogate.data import FrameSets, collect_frames, collect_sets, in_standard_pose
 from systems.errors import InputError
 from systems.prepare.molecule import scene_from_smiles
 from systems.scene import Scene

@@ -11,9 +11,16 @@ import numpy as np
 import pytest
 import torch
 
-from surrogate.data.frames import TrainingFrames, at_rest, collect_frames, load_frames, quantise
-from surrogate.models.painet.model import Painet, PainetConfig
-from surrogate.models.painet.trainer import PainetTraining, StateWindows, for_frames, forecast_errors, train_painet
+from surrogate.data import TrainingFrames, at_rest, collect_frames, load_frames, quantise
+from surrogate.models.painet.model import (
+    Painet,
+    PainetConfig,
+    PainetTraining,
+    StateWindows,
+    for_frames,
+    forecast_errors,
+    train_painet,
+)
 from surrogate.models.propagator import Chunk, Molecule
 from surrogate.models.weights import load_weights
 from surrogate.sampling.runner import RolloutConfig, rollout
@@ -83,22 +90,6 @@ def test_it_learns_the_flow_of_a_spring_better_than_the_frozen_frame(tmp_path: P
     # The last velocity is learned too: wrong by less than a third of what it changes by.
     changes = StateWindows(frames, c, torch.device("cpu")).change_scale_nm_ps
     assert float(row["validation_velocity_nm_ps"]) < changes / 3
-
-
-def test_leapfrog_learns_the_flow_of_a_spring_better_than_the_decoder_of_the_paper(
-    tmp_path: Path, diatomic: Scene
-) -> None:
-    frames = frames_of(diatomic)
-    config = PainetTraining(steps=150, batch=32, validate_every_s=1e9, learning_rate=1e-2, noise=0.0, pushforward=0.0,
-                            velocity_weight=1.0, every_frame=True)  # fmt: skip
-    errors = {}
-    for decoder in ("leapfrog", "egnn"):
-        model = replace(SMALL, decoder=decoder, n_decoder_layers=3)
-        out = train_painet(frames, tmp_path / f"{decoder}.safetensors", model, config)
-        (row,) = csv.DictReader(out.with_suffix(".csv").open())
-        errors[decoder] = float(row["validation_f_mse_a2"]), float(row["validation_velocity_nm_ps"])
-    assert errors["leapfrog"][0] < 0.1 * errors["egnn"][0]
-    assert errors["leapfrog"][1] < 0.5 * errors["egnn"][1]
 
 
 class Spy(Painet):
@@ -184,9 +175,6 @@ def test_windows_hold_states_and_futures_at_the_stride(diatomic: Scene) -> None:
     assert torch.equal(x_new[:, 0], windows.state(first + 2)[0])
     assert torch.equal(x_new[:, 2], windows.state(first + 6)[0])
     assert torch.equal(v_new, windows.state(first + 6)[1])
-    assert torch.equal(windows.velocities_after(first)[:, 1], windows.state(first + 4)[1])
-    # Straight flight misses the first frame by less than the last.
-    assert (windows.frame_scales[:, 2] > 2 * windows.frame_scales[:, 0]).all()
     # A chunk and its successor lie within one trajectory, before its validation block.
     assert ((windows.starts % 160) + 2 * 6 < 152).all()
     assert (windows.held % 160 >= 152).all()

@@ -54,7 +54,7 @@ def domain(alanine_dipeptide: Scene, md: np.ndarray) -> TrainingDomain:
 @pytest.fixture
 def short_energy_sample(monkeypatch: pytest.MonkeyPatch) -> None:
     """A tenth of the MD that energies are otherwise measured against."""
-    from surrogate.sampling.openmm import coupling
+    from surrogate.sampling import coupling
 
     monkeypatch.setattr(coupling, "_DISCARDED_PS", 2.0)
     monkeypatch.setattr(coupling, "_SAMPLES", 30)

@@ -25,7 +25,7 @@ from scripted_model import (
 )
 from surrogate.models.propagator import Propagator
 from surrogate.models.weights import TrainingDomain
-from surrogate.sampling.interventions import (
+from surrogate.sampling.chunks import (
     CAUGHT,
     DRAWN_AGAIN,
     MD_AFTER_FAILURE,

@@ -13,15 +13,14 @@ import torch
 
 from md_reference.forces.quantum import Potential
 from surrogate.comparison.read.ensemble import load_ensemble
-from surrogate.data.shipped import weights_path
+from surrogate.models.architecture import weights_path
+from surrogate.models.painet.energy import PainetPotential, PotentialConfig
 from surrogate.models.painet.model import Painet, PainetConfig
-from surrogate.models.painet.potential.energy import PotentialConfig
-from surrogate.models.painet.potential.model import PainetPotential
 from surrogate.models.weights import TrainingDomain, Weights, load_weights
 from surrogate.sampling import runner
 from surrogate.sampling.domain import in_bath
-from surrogate.sampling.openmm.simulation import KJ_MOL_PER_EV, LearnedForces
 from surrogate.sampling.runner import RolloutConfig, rollout
+from surrogate.sampling.simulation import KJ_MOL_PER_EV, LearnedForces
 from systems.chemistry.graph import match_atoms
 from systems.chemistry.validity import ENERGY, UNSURE, geometry_from_frames
 from systems.errors import InputError, OutOfDomainError, SurromdError

@@ -10,8 +10,8 @@ import pytest
 import torch
 
 from surrogate import api
-from surrogate.data.frames import Split, TrainingFrames, canonicalise, quantise
-from surrogate.data.shipped import weights_path
+from surrogate.data import Split, TrainingFrames, canonicalise, quantise
+from surrogate.models.architecture import weights_path
 from surrogate.models.peptides.layout import PeptideConfig, chain_features, standard_peptide
 from surrogate.models.peptides.model import PeptideSlide
 from surrogate.models.peptides.subjects import PeptideSubject

@@ -16,9 +16,8 @@ from scripted_model import (
     weights_of,
 )
 from surrogate.models.weights import TrainingDomain
-from surrogate.sampling.chunks import ChunkSampler
-from surrogate.sampling.interventions import CAUGHT, MD_BETWEEN, Guard
-from surrogate.sampling.openmm.coupling import Coupling
+from surrogate.sampling.chunks import CAUGHT, MD_BETWEEN, ChunkSampler, Guard
+from surrogate.sampling.coupling import Coupling
 from surrogate.sampling.runner import RolloutConfig
 from systems.chemistry.validity import ENERGY
 from systems.errors import InputError, UnknownNameError
@@ -83,7 +82,7 @@ def test_help_has_flexible_bonds_where_the_reference_had(domain: TrainingDomain,
 def test_weights_that_name_no_force_field_cannot_be_coupled(
     tmp_path: Path, scene: Scene, domain: TrainingDomain
 ) -> None:
-    for conditions, said in (({}, "which force_field"), ({**CONDITIONS, "force_field": "ff00"}, "ff00")):
+    for conditions, said in (({}, "their force_field"), ({**CONDITIONS, "force_field": "ff00"}, "ff00")):
         weights = weights_of(replace(domain, conditions=conditions))
         with pytest.raises(InputError, match=f"cannot be coupled to OpenMM.*{said}"):
             roll(tmp_path / "a.h5", scene, weights, "repair")

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from surrogate.models.weights import Weights
-from surrogate.sampling.openmm.simulation import Simulation
 from surrogate.sampling.runner import RolloutConfig, rollout
+from surrogate.sampling.simulation import Simulation
 from systems.errors import InputError, OutOfDomainError, SimulationError
 from systems.scene import Scene
 from systems.trajectory.codec import open_trajectory

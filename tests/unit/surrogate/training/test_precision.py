@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 
-from surrogate.data.shipped import weights_path
+from surrogate.models.architecture import weights_path
 from surrogate.models.weights import Weights, load_weights
 from surrogate.sampling.chunks import ChunkSampler
 from surrogate.sampling.runner import RolloutConfig, rollout

@@ -11,10 +11,9 @@ import numpy as np
 import pytest
 import torch
 
-from surrogate.data.frames import TrainingFrames, collect_frames, is_windows, load_frames, quantise
-from surrogate.models.lam_slide.model import LamSlide
-from surrogate.models.lam_slide.network import LamSlideConfig, draw_identifiers
-from surrogate.models.lam_slide.trainer import FlowWindows, TrainingConfig, flow_loss, train_lam_slide, window_frames
+from surrogate.data import TrainingFrames, collect_frames, is_windows, load_frames, quantise
+from surrogate.models.lam_slide.model import LamSlide, LamSlideConfig, draw_identifiers
+from surrogate.models.lam_slide.trainer import TrainingConfig, flow_loss, train_lam_slide, window_frames
 from surrogate.models.weights import Weights, load_weights, provenance_of, read_header, save_weights
 from surrogate.training.loop import StageConfig, StagePlace, learning_rate_factor, run_stage
 from systems.errors import InputError, SimulationError, WeightsError
@@ -190,7 +189,7 @@ def test_references_that_do_not_belong_together_are_refused(tmp_path: Path, alan
 
 
 def test_canonical_frames_are_superposed_on_the_template(tmp_path: Path, alanine_dipeptide: Scene) -> None:
-    from surrogate.data.frames import QUANTUM_NM
+    from surrogate.data import QUANTUM_NM
 
     scene = alanine_dipeptide
     angle = 1.0
@@ -247,7 +246,7 @@ def test_given_frames_count_in_the_loss_where_they_are_asked_to(small_model_conf
                             loss_on_given=on_given)  # fmt: skip
         model = LamSlide(replace(small_model_config, approximator=stage_two))
         model.approximator = Zeros()
-        loss, _ = flow_loss(model, FlowWindows(latents, 22), tau, torch.Generator().manual_seed(1))
+        loss, _ = flow_loss(model, latents, 22, tau, torch.Generator().manual_seed(1))
         torch.testing.assert_close(loss, counted.square().mean())
     with pytest.raises(InputError, match="clean_conditioning"):
         replace(stage_two, clean_conditioning=True)

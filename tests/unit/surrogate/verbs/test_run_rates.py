@@ -18,7 +18,7 @@ from md_reference.run.config import MDConfig
 from md_reference.simd import force_field
 from md_reference.simd.system_terms import SimdUnavailableError
 from surrogate.comparison.read.ensemble import Ensemble
-from surrogate.data.shipped import weights_path
+from surrogate.models.architecture import weights_path
 from surrogate.models.potential import Potential
 from surrogate.models.weights import load_weights
 from surrogate.verbs.run import rates as measuring

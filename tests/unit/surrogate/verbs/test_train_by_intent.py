@@ -12,10 +12,10 @@ from safetensors.numpy import load_file
 
 import surrogate as sm
 from command_line import SMALL_LAM_SLIDE, run
-from surrogate.data.references import References
+from surrogate.data import References
 from surrogate.models.architecture import TrainingRequest, toml_text
 from surrogate.models.lam_slide import trainer as choices
-from surrogate.models.lam_slide.network import LamSlideConfig
+from surrogate.models.lam_slide.model import LamSlideConfig
 from surrogate.models.lam_slide.trainer import TrainingConfig, train_lam_slide
 from surrogate.models.peptides.layout import PeptideConfig
 from surrogate.models.peptides.trainer import PeptideTraining

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from surrogate import api
-from surrogate.data.frames import TrainingFrames
-from surrogate.data.shipped import weights_path
+from surrogate.data import TrainingFrames
+from surrogate.models.architecture import weights_path
 from surrogate.models.weights import Weights, load_weights, save_weights
 from surrogate.verbs.train_verdict import TrainingVerdict, compare_training, word_of
 from systems.scene import Scene

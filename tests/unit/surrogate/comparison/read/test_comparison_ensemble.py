@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from surrogate.comparison.read.ensemble import Ensemble, alike, load_ensemble
-from surrogate.data.frames import collect_frames
+from surrogate.data import collect_frames
 from surrogate.verbs.outputs import find_trajectories
 from surrogate.verbs.run.stages import notable
 from systems.chemistry.geometry import torsion

@@ -7,11 +7,11 @@ import pytest
 import torch
 
 from small_scenes import with_phi_turned
-from surrogate.data.frames import TrainingFrames, canonicalise, quantise
+from surrogate.data import TrainingFrames, canonicalise, quantise
 from surrogate.models.peptides.layout import PeptideConfig, chain_features
 from surrogate.models.peptides.model import PeptideSlide
 from surrogate.models.peptides.subjects import PeptideSubject
-from surrogate.models.peptides.trainer import balance_entries, lacking_entries, told_phis, with_scale
+from surrogate.models.peptides.trainer import balance_entries, lacking_entries, weighted_phis, with_scale
 from systems.prepare.peptide import build_peptide
 
 SHARE = 0.02
@@ -40,11 +40,11 @@ def test_as_many_frames_enter_as_leave() -> None:
     model.jumps.of_change[0, :, 0, 0, 1] = torch.randn(len(model.token_mean))
     model.jumps.beside_change[:, :, 0, 0, 1] = 0.1 * torch.randn(2, len(model.token_mean))
     model.jumps.logits.weight.normal_(std=0.05)
-    before = [lacking_entries(model, phi) for subject in subjects for phi in told_phis(model, subject)]
+    before = [lacking_entries(model, phi) for subject in subjects for phi in weighted_phis(model, subject)]
     assert len(before) == 6 and max(map(abs, before)) > 2.0
     leaving = model.jumps.of_change[:, :, :, 1].clone()
     balance_entries(model, subjects)
-    after = [lacking_entries(model, phi) for subject in subjects for phi in told_phis(model, subject)]
+    after = [lacking_entries(model, phi) for subject in subjects for phi in weighted_phis(model, subject)]
     assert max(map(abs, after)) < 0.35
     assert torch.equal(model.jumps.of_change[:, :, :, 1], leaving), "the probabilities of leaving are what they were"
 
@@ -54,7 +54,7 @@ def test_how_likely_the_rare_side_is_sets_the_probabilities() -> None:
     config = with_scale(PeptideConfig(width=16, n_layers=1, n_heads=1, chunk_frames=4), [frames])
     subject = _subject(frames, config)
     model = PeptideSlide(config).requires_grad_(False)
-    (phi,) = told_phis(model, subject)
+    (phi,) = weighted_phis(model, subject)
     # Odds are the same from either side at first.
     assert lacking_entries(model, phi) == pytest.approx(np.log(SHARE / (1.0 - SHARE)), abs=1e-3)
     assert [config.types[place - 2] for place in phi.places] == ["ALA", "ACE", "NME"]
@@ -63,7 +63,7 @@ def test_how_likely_the_rare_side_is_sets_the_probabilities() -> None:
 def test_before_a_proline_nothing_is_said() -> None:
     frames = _frames("ACE-ALA-PRO-ALA-NME")
     config = with_scale(PeptideConfig(width=16, n_layers=1, n_heads=1, chunk_frames=4), [frames])
-    phis = told_phis(PeptideSlide(config).requires_grad_(False), _subject(frames, config))
+    phis = weighted_phis(PeptideSlide(config).requires_grad_(False), _subject(frames, config))
     assert [phi.residue for phi in phis] == [3]
 
 
@@ -73,7 +73,7 @@ def test_a_side_without_frames_or_weights_says_nothing() -> None:
     model = PeptideSlide(config).requires_grad_(False)
     one_sided = PeptideSubject(frames, chain_features(frames.scene, config), np.repeat([2.0, 0.0], EACH))
     alone = PeptideSubject(frames, chain_features(frames.scene, config))
-    assert told_phis(model, one_sided) == [] and told_phis(model, alone) == []
+    assert weighted_phis(model, one_sided) == [] and weighted_phis(model, alone) == []
     kept = {name: tensor.clone() for name, tensor in model.state_dict().items()}
     balance_entries(model, [one_sided, alone])
     assert all(torch.equal(tensor, kept[name]) for name, tensor in model.state_dict().items())

@@ -11,6 +11,7 @@ import torch
 
 from surrogate.models.peptides.chains import (
     FREE_ENDS,
+    MOST_TORSIONS,
     RIGID,
     STIFF,
     TURNING,
@@ -26,7 +27,6 @@ from surrogate.models.peptides.layout import (
     stated_torsions,
     unknown_coordinates,
 )
-from surrogate.models.peptides.torsion_states import MOST_TORSIONS
 from systems.chemistry.validity import INVALID, check_frames, geometry_from_frames
 from systems.errors import InputError
 from systems.prepare.molecule import scene_from_smiles

@@ -6,9 +6,19 @@ import pytest
 import torch
 
 from surrogate.models.peptides import chains as settling
-from surrogate.models.peptides.chains import ChainFeatures, dihedral, mirrored, resolve_settings
+from surrogate.models.peptides.chains import (
+    MOST_TORSIONS,
+    PHI,
+    PSI,
+    RING,
+    THREEFOLD,
+    ChainFeatures,
+    StatedTorsions,
+    dihedral,
+    mended,
+    mirrored,
+)
 from surrogate.models.peptides.layout import PeptideConfig, chain_features, chain_layout, chain_scale
-from surrogate.models.peptides.torsion_states import MOST_TORSIONS, PHI, PSI, RING, THREEFOLD, StatedTorsions
 from systems.prepare.peptide import build_peptide
 from systems.scene import Scene
 
@@ -64,7 +74,7 @@ def test_overlapping_atoms_are_turned_apart_and_nothing_else_is(
     overlap = chain.overlap(before)
     assert 0.2 < overlap.float().mean() < 0.9
     with torch.inference_mode():  # as in rollouts
-        frames, astray, still = resolve_settings(tokens, states, chain)
+        frames, astray, still = mended(tokens, states, chain)
     torch.testing.assert_close(frames[~overlap], before[~overlap], rtol=0, atol=1e-6)
     assert torch.equal(still, chain.overlap(frames)) and still.sum() < 0.15 * overlap.sum()
     right = ~astray & ~still
@@ -80,7 +90,7 @@ def test_overlapping_atoms_are_turned_apart_and_nothing_else_is(
     )
     # Each frame by itself.
     one = int(torch.nonzero(overlap)[3])
-    torch.testing.assert_close(resolve_settings(tokens[one : one + 1], states[one : one + 1], chain)[0][0], frames[one],
+    torch.testing.assert_close(mended(tokens[one : one + 1], states[one : one + 1], chain)[0][0], frames[one],
                                rtol=0, atol=1e-5)  # fmt: skip
 
 
@@ -89,7 +99,7 @@ def test_without_turns_they_stay_where_they_are(
 ) -> None:
     chain, tokens, states = crowded
     monkeypatch.setattr(settling, "_TURNS", 0)
-    frames, astray, still = resolve_settings(tokens, states, chain)
+    frames, astray, still = mended(tokens, states, chain)
     assert torch.equal(still, chain.overlap(chain.code.decode(tokens))) and not astray.any()
     torch.testing.assert_close(frames, chain.code.decode(tokens), rtol=0, atol=1e-6)
 

@@ -10,20 +10,19 @@ import pytest
 import torch
 
 from small_scenes import with_phi_turned
-from surrogate.models.peptides.chains import ChainFeatures, resolve_settings
-from surrogate.models.peptides.layout import PeptideConfig, chain_features, chain_layout, chain_scale
-from surrogate.models.peptides.model import PeptideSlide
-from surrogate.models.peptides.torsion_states import (
+from surrogate.models.peptides.chains import (
     MOST_TORSIONS,
     PHI,
     PSI,
     RING,
     THREEFOLD,
+    ChainFeatures,
     StatedTorsions,
-    StateJumps,
     conditioning_states,
-    times_apart,
+    mended,
 )
+from surrogate.models.peptides.layout import PeptideConfig, chain_features, chain_layout, chain_scale
+from surrogate.models.peptides.model import PeptideSlide, StateJumps, times_apart
 from systems.chemistry.geometry import torsion
 from systems.prepare.peptide import build_peptide
 from systems.scene import Scene
@@ -313,12 +312,12 @@ def test_a_chunk_whose_atoms_overlap_is_drawn_again_in_the_same_states(monkeypat
     seen: list[int] = []
 
     def resolved(tokens: torch.Tensor, *conditioning: Any) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-        frames, astray, crowded = resolve_settings(tokens, *conditioning)
+        frames, astray, crowded = mended(tokens, *conditioning)
         seen.append(len(frames) // model.n_new)
         crowded[model.n_new - 1] = len(seen) < 3
         return frames, astray, crowded
 
-    monkeypatch.setattr(module, "resolve_settings", resolved)
+    monkeypatch.setattr(module, "mended", resolved)
     last = torch.tensor(scene.positions_nm).float().expand(3, 1, -1, -1)
     noise = torch.randn(3, *model.noise_shape(scene.n_atoms), generator=torch.Generator().manual_seed(3))
     chunk = model.next_chunk(last, molecule, noise, solver_steps=2)

@@ -1,19 +1,23 @@
-"""Training frames of one scene, read from trajectories: their pose, their split, and int16 to keep them in."""
+"""Frames to train on: of one scene or of several, read from trajectories, posed, split, and kept as int16."""
 
 from __future__ import annotations
 
 import hashlib
 import json
 import tempfile
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field, fields, replace
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
+import torch
+from torch import Tensor
 
 from systems.chemistry.geometry import superpose
+from systems.chemistry.graph import molecule_key
 from systems.errors import InputError, TrajectoryError, first_line
 from systems.files.schema import built, parsed
 from systems.files.whole_file import create_whole
@@ -26,23 +30,17 @@ if TYPE_CHECKING:
     from systems.trajectory.base import TrajectoryReader
 
 
-# The pose of a scene that its own shape decides, so that a molecule that no training saw has one too.
-
-FloatArray = npt.NDArray[np.float64]
-
-
 def fitted_atoms(scene: Scene) -> npt.NDArray[np.int64]:
     """Return the atoms that frames are superposed by: the heavy ones, all where fewer than three are heavy."""
     return scene.heavy_idx if len(scene.heavy_idx) >= 3 else np.arange(scene.n_atoms)
 
 
-def standard_turn(scene: Scene) -> FloatArray:
+def standard_turn(scene: Scene) -> npt.NDArray[np.float64]:
     """Return the rotation `(3, 3)` R that lays a scene along its own axes: x moves to `x @ R.T`.
 
     Axes are the principal ones of the fitted atoms, the longest first; the first two point to where the third moment of
-    all atoms does, the third completes a right-handed system. A scene turned first gives the same result, but for
-    shapes that leave the axes open (one atom, a line, a symmetric top, mirror-symmetric along an axis): there the pose
-    depends on how the scene came.
+    all atoms does, the third completes a right-handed system. So a molecule that no training saw has a pose, too, which
+    does not depend on how the scene came, but for shapes that leave the axes open (a line, a symmetric top).
     """
     idx = fitted_atoms(scene)
     centred = scene.positions_nm - scene.positions_nm[idx].mean(axis=0)
@@ -62,12 +60,10 @@ def in_standard_pose(scene: Scene) -> Scene:
     return scene.with_positions(centred @ standard_turn(scene).T)
 
 
-# Splits of frames into training and validation, and the proof that no stretch of motion is in both.
-
 # Successive frames that must agree for a leak: one may coincide by chance in a system of one particle, a run does not.
 RUN = 4
-_LEAK_BLOCK = 8192
-IntArray = npt.NDArray[np.int64]
+# Frames that pass through memory at once.
+_BLOCK = 8192
 
 
 @dataclass(frozen=True)
@@ -94,14 +90,6 @@ class Split:
                 cut = begin if k in self.held else end
             found.append((cut, end) if validation else (begin, cut))
         return [(low, high) for low, high in found if high > low]
-
-    def to_dict(self) -> dict[str, Any]:
-        return {"share": self.share, "held": list(self.held)}
-
-    @staticmethod
-    def from_dict(record: dict[str, Any]) -> Split:
-        """Rebuild a split. Raises ValueError for what is none."""
-        return built(Split, record)
 
 
 def refuse_leaks(coordinates: npt.NDArray[Any], starts: npt.NDArray[Any], split: Split,
@@ -132,8 +120,8 @@ def _runs(coordinates: npt.NDArray[Any], ranges: list[tuple[int, int]]) -> Itera
     rng = np.random.default_rng(0)
     factors = rng.integers(0, 2**64, size=coordinates[0].size, dtype=np.uint64) | np.uint64(1)
     for low, high in ranges:
-        for start in range(low, high - RUN + 1, _LEAK_BLOCK):
-            block = coordinates[start : min(start + _LEAK_BLOCK + RUN - 1, high)]
+        for start in range(low, high - RUN + 1, _BLOCK):
+            block = coordinates[start : min(start + _BLOCK + RUN - 1, high)]
             # Products and sums wrap: a fingerprint modulo 2^64.
             marks = block.reshape(len(block), -1).astype(np.int64).view(np.uint64) @ factors
             n = len(marks) - RUN + 1
@@ -143,17 +131,12 @@ def _runs(coordinates: npt.NDArray[Any], ranges: list[tuple[int, int]]) -> Itera
             yield start, runs
 
 
-# Training frames of one scene in compact form: read from trajectories, canonicalised once, kept as int16.
-# In a windows file they lie uncompressed and are mapped, not read: a training takes from a file larger than memory what
-# its windows need.
-
+# Training frames of one scene in compact form: read from trajectories, canonicalised once, kept as int16; in a windows
+# file they are mapped, not read.
 # One unit of the int16 coordinates: 0.0002 nm, range +-6.5 nm. Thermal motion of a bond is ten times larger.
 QUANTUM_NM = 2e-4
-_BLOCK = 8192
 # Frames beyond this are kept in a file.
 MEMORY_BYTES = 2_000_000_000
-# Frames are written into an array or a dataset of HDF5.
-Target = Any
 CONDITIONS = ("force_field", "solvent", "temperature_k", "friction_per_ps", "timestep_ps", "hydrogen_mass_da")
 
 
@@ -169,24 +152,16 @@ class _Header:
     quantum_nm: float = QUANTUM_NM
     split: Split = field(default_factory=Split)
 
-    def of(
-        self,
-        coordinates: npt.NDArray[np.int16],
-        starts: npt.NDArray[np.int64],
-        velocities: npt.NDArray[np.float32] | None,
-    ) -> TrainingFrames:
+    def of(self, coordinates: Any, starts: npt.NDArray[np.int64], velocities: Any) -> TrainingFrames:
         """Return the frames in `coordinates` (n_frames, n_atoms, 3) int16, with this header."""
-        said = {f.name: getattr(self, f.name) for f in fields(_Header) if f.name != "quantum_nm"}
-        return TrainingFrames(**said, coordinates=coordinates, starts=starts, velocities=velocities)
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return the header as JSON has it."""
-        plain = {"scene": self.scene.to_dict(), "sources": list(self.sources), "split": self.split.to_dict()}
-        return {f.name: getattr(self, f.name) for f in fields(_Header)} | plain
+        return TrainingFrames(self.scene, coordinates, starts, self.lag_ps, self.canonical, self.conditions,
+                              self.sources, velocities, self.split)  # fmt: skip
 
     def enter(self, handle: h5py.File, starts: npt.NDArray[np.int64]) -> None:
         """Write header and `starts` into a windows file that holds the frames already."""
-        handle.attrs["surromd_windows"] = json.dumps(self.to_dict())
+        split = {"share": self.split.share, "held": list(self.split.held)}
+        plain = {"scene": self.scene.to_dict(), "sources": list(self.sources), "split": split}
+        handle.attrs["surromd_windows"] = json.dumps({**vars(self), **plain})
         handle.create_dataset("starts", data=starts)
 
 
@@ -226,9 +201,7 @@ class TrainingFrames:
 
     def window_starts(self, length: int, *, validation: bool) -> npt.NDArray[np.int64]:
         """Return the first frames of all windows of `length` frames that cross no boundary of trajectories or split.
-
-        No window reaches from one part into the other, so nothing that is held out is trained on.
-        """
+        Raises InputError where there is none."""
         found = [
             np.arange(low, high - length + 1, dtype=np.int64)
             for low, high in self.split.ranges(self.starts, validation=validation)
@@ -258,10 +231,6 @@ class TrainingFrames:
         names = [str(source["file"]) for source in self.sources]
         refuse_leaks(self.coordinates, self.starts, self.split, lambda k: names[k] if names else f"trajectory {k}")
 
-    def header(self) -> _Header:
-        """Return what a windows file says of its frames."""
-        return _Header(**{f.name: getattr(self, f.name) for f in fields(_Header) if f.name != "quantum_nm"})
-
     def save(self, path: str | Path) -> None:
         """Write one HDF5 file that `load_frames` takes back; it appears whole or not at all."""
         if self.turn is not None:
@@ -274,7 +243,9 @@ class TrainingFrames:
                     handle["coordinates"][part] = self.coordinates[part]
                     if self.velocities is not None:
                         handle["velocities"][part] = self.velocities[part]
-                self.header().enter(handle, self.starts)
+                _Header(self.scene, self.lag_ps, self.canonical, self.conditions, self.sources, split=self.split).enter(
+                    handle, self.starts
+                )
 
         create_whole(Path(path), fill)
 
@@ -291,10 +262,7 @@ def _new_file(path: Path, n_frames: int, n_atoms: int, *, moving: bool) -> h5py.
 
 
 def load_frames(path: str | Path) -> TrainingFrames:
-    """Map what `TrainingFrames.save` wrote; files of earlier versions, compressed, are read whole.
-
-    Raises InputError for any other file.
-    """
+    """Map what `TrainingFrames.save` wrote. Raises InputError for any other file."""
     path = Path(path)
     try:
         with open_hdf5(path) as handle:
@@ -310,9 +278,8 @@ def load_frames(path: str | Path) -> TrainingFrames:
 
 
 def _mapped(path: Path, dataset: h5py.Dataset) -> npt.NDArray[Any]:
-    offset = dataset.id.get_offset() if dataset.chunks is None else None
-    if offset is None:
-        return dataset[:]
+    if (offset := dataset.id.get_offset()) is None:
+        raise ValueError(f"{dataset.name} lies in pieces")
     return np.memmap(path, dtype=dataset.dtype, mode="r", offset=offset, shape=dataset.shape)
 
 
@@ -326,14 +293,9 @@ def is_windows(path: Path) -> bool:
 
 
 def collect_frames(
-    paths: list[Path],
-    *,
-    canonical: bool = True,
-    velocities: bool = False,
-    held: list[Path] | None = None,
-    memory_bytes: int = MEMORY_BYTES,
-    spool: Path | None = None,
-) -> TrainingFrames:
+    paths: list[Path], *, canonical: bool = True, velocities: bool = False, held: list[Path] | None = None,
+    memory_bytes: int = MEMORY_BYTES, spool: Path | None = None,
+) -> TrainingFrames:  # fmt: skip
     """Read reference trajectories of one scene. Raises InputError when scenes, save intervals or conditions differ.
 
     With `velocities`, which excludes `canonical`, frames keep their pose and must carry velocities, natural masses'.
@@ -353,12 +315,7 @@ def collect_frames(
 
 
 def write_windows(
-    paths: list[Path],
-    out: Path,
-    *,
-    canonical: bool = True,
-    velocities: bool = False,
-    held: list[Path] | None = None,
+    paths: list[Path], out: Path, *, canonical: bool = True, velocities: bool = False, held: list[Path] | None = None
 ) -> None:
     """Write what `collect_frames` returns to a windows file, block by block: trajectories may be larger than memory."""
     found = _survey(paths, held or [], canonical=canonical, velocities=velocities)
@@ -380,8 +337,9 @@ class _Survey:
     header: _Header
     starts: npt.NDArray[np.int64]
 
-    def read_into(self, coordinates: Target, moving: Target | None) -> _Header:
-        """Read all frames into `coordinates` and `moving` (arrays or data sets); return the header with its sources."""
+    def read_into(self, coordinates: Any, moving: Any) -> _Header:
+        """Read all frames into `coordinates` and, unless None, `moving` (arrays or data sets); return the header with
+        its sources."""
         from systems.trajectory.codec import open_trajectory
 
         scene, sources = self.header.scene, []
@@ -394,9 +352,12 @@ class _Survey:
                     if moving is not None:
                         given = _velocities(reader, at - begin, len(frames))
                         moving[at : at + len(frames)] = at_rest(given, scene.masses_da).astype(np.float32)
-                        block = quantise(at_rest(frames, scene.masses_da))
+                        posed = at_rest(frames, scene.masses_da)
+                    elif self.header.canonical:
+                        posed = canonicalise(frames, scene)
                     else:
-                        block = quantise(canonicalise(frames, scene) if self.header.canonical else centre(frames))
+                        posed = frames - frames.mean(axis=1, keepdims=True)
+                    block = quantise(posed)
                     coordinates[at : at + len(frames)] = block
                     digest.update(block.tobytes())
                     at += len(frames)
@@ -473,14 +434,245 @@ def canonicalise(frames_nm: npt.NDArray[Any], template: Scene) -> npt.NDArray[An
     return superpose(frames_nm, target, idx=idx)
 
 
-def centre(frames_nm: npt.NDArray[Any]) -> npt.NDArray[Any]:
-    """Return frames with their centroid at the origin."""
-    return frames_nm - frames_nm.mean(axis=1, keepdims=True)
-
-
 def quantise(frames_nm: npt.NDArray[Any]) -> npt.NDArray[np.int16]:
     """Round to int16 units of QUANTUM_NM. Raises InputError for a system wider than the format's +-6.5 nm."""
     scaled = np.rint(np.asarray(frames_nm, dtype=np.float64) / QUANTUM_NM)
     if np.abs(scaled).max(initial=0) > 32767:
         raise InputError(f"atoms lie more than {32767 * QUANTUM_NM:.1f} nm from the centre; is the molecule whole?")
     return scaled.astype(np.int16)
+
+
+@dataclass(frozen=True, eq=False)
+class FrameSets:
+    """Frames of several molecules. Those `trained` on hold their own validation stretches; those of `unseen` are held
+    out whole: curves are measured on them, and nothing is learned from them."""
+
+    trained: tuple[TrainingFrames, ...]
+    unseen: tuple[TrainingFrames, ...] = ()
+
+    @property
+    def names(self) -> str:
+        return ", ".join(frames.scene.name for frames in self.trained)
+
+    @property
+    def origin(self) -> dict[str, Any]:
+        """How much reference is trained on, and of which files, as the record of a training has it."""
+        sources = [source for frames in self.trained for source in frames.sources]
+        return {"reference_ns": sum(frames.total_ps for frames in self.trained) * 1e-3, "sources": sources}
+
+
+def collect_sets(paths: list[Path], *, held: list[Path] | None = None, spool: Path | None = None) -> FrameSets:
+    """Read reference trajectories, or windows files, of any number of molecules, canonical and in standard poses.
+
+    Trajectories in `held` of a molecule that is trained on are its validation; molecules that appear in `held` alone
+    are held out as systems. Raises InputError when save intervals or temperatures differ, when one molecule comes in
+    two atom orders, so that it would be trained on under one and held out under the other, and for leaks of frames.
+    """
+    seen, also = _by_topology(paths), _by_topology(held or [])
+    trained = [_read(files, also.pop(key, []), spool) for key, files in seen.items()]
+    unseen = [_read(files, [], spool) for files in also.values()]
+    unseen = [replace(frames, split=Split(held=tuple(range(len(frames.starts) - 1)))) for frames in unseen]
+    sets = FrameSets(tuple(map(_pose, trained)), tuple(map(_pose, unseen)))
+    first, keys = sets.trained[0], dict[str, TrainingFrames]()
+    for frames in (*sets.trained, *sets.unseen):
+        name = frames.scene.name
+        if not np.isclose(frames.lag_ps, first.lag_ps, rtol=1e-4):
+            raise InputError(
+                f"{name} is saved every {frames.lag_ps:g} ps, {first.scene.name} every {first.lag_ps:g} ps; one model "
+                "learns one interval (and multiples of it)."
+            )
+        asked, known = (f.conditions.get("temperature_k") for f in (frames, first))
+        if asked != known:
+            raise InputError(f"{name} was made at {asked} K, {first.scene.name} at {known} K; this model takes none.")
+        other = keys.setdefault(molecule_key(frames.scene), frames)
+        if other is not frames:
+            both = " and would be both trained on and held out" if frames in sets.unseen else ""
+            raise InputError(
+                f"{name} and {other.scene.name} are one molecule in two atom orders{both}; give it in one."
+            )
+        frames.refuse_leaks()
+    return sets
+
+
+def _by_topology(paths: list[Path]) -> dict[str, list[Path]]:
+    found: dict[str, list[Path]] = {}
+    for path in paths:
+        key = f"windows {path}" if is_windows(path) else _summary(path).scene.topology_hash
+        found.setdefault(key, []).append(path)
+    return found
+
+
+def _read(paths: list[Path], held: list[Path], spool: Path | None) -> TrainingFrames:
+    if not is_windows(paths[0]):
+        return collect_frames(paths, held=held, spool=spool)
+    frames = load_frames(paths[0])
+    if not frames.canonical:
+        raise InputError(f"{paths[0]} holds frames in their own pose; make it without `velocities=True`.")
+    return frames
+
+
+def _pose(frames: TrainingFrames) -> TrainingFrames:
+    """Return the frames with their template along its own axes; they are turned as they are read."""
+    return replace(frames, scene=in_standard_pose(frames.scene), turn=standard_turn(frames.scene))
+
+
+# Windows of frames that stand one, two, ... up to a thousand spacings apart, for a model that takes the lag.
+
+_PER_DECADE = 8
+
+
+def strides_up_to(longest: int) -> tuple[int, ...]:
+    """Return strides from 1 to `longest`, evenly spaced in their logarithm, about eight a decade."""
+    n = max(2, round(_PER_DECADE * np.log10(longest)) + 1)
+    return tuple(sorted({round(float(x)) for x in np.geomspace(1, longest, n)})) if longest > 1 else (1,)
+
+
+@dataclass(frozen=True, eq=False)
+class StrideSampler:
+    """Draws windows of any of `strides`, each as likely; `starts[k]` (n_k,) are the first frames of those of stride
+    k."""
+
+    strides: tuple[int, ...]
+    starts: tuple[Tensor, ...]
+
+    @staticmethod
+    def of(frames: TrainingFrames, length: int, strides: Sequence[int], *, validation: bool = False) -> StrideSampler:
+        """Return the sampler of windows of `length` frames. Raises InputError where one of the longest does not fit
+        into a training stretch; validation takes those that fit."""
+        found: list[tuple[int, Tensor]] = []
+        for stride in strides:
+            span = (length - 1) * stride + 1
+            try:
+                found.append((stride, torch.from_numpy(frames.window_starts(span, validation=validation))))
+            except InputError as error:
+                if validation and found:
+                    break
+                raise InputError(
+                    f"{frames.scene.name}: no window of {length} frames {stride * frames.lag_ps:g} ps apart fits; give "
+                    "longer trajectories, a shorter `longest_lag_ps` or shorter chunks."
+                ) from error
+        return StrideSampler(tuple(s for s, _ in found), tuple(starts for _, starts in found))
+
+    def draw(self, n: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+        """Return first frames `(n,)` and strides `(n,)`."""
+        which = torch.randint(len(self.strides), (n,), generator=generator)
+        place = torch.rand(n, generator=generator, dtype=torch.float64)
+        sizes = torch.tensor([len(starts) for starts in self.starts])
+        first = torch.empty(n, dtype=torch.int64)
+        for k, starts in enumerate(self.starts):
+            rows = which == k
+            first[rows] = starts[(place[rows] * sizes[k]).long()]
+        return first, torch.tensor(self.strides)[which]
+
+
+@dataclass(frozen=True, eq=False)
+class Survey:
+    """A summary of the trajectories to train on, made without reading their frames.
+
+    `scenes`: each molecule trained on once; `unseen`: those that appear in the validation alone. `longest`: frames of
+    the longest trajectory of each of `scenes`, `n_frames` all that are trained on. `lag_ps`: time between frames.
+    `velocities`: whether all files carry them. `equilibrium`: whether all were simulated at constant temperature.
+    """
+
+    scenes: tuple[Scene, ...]
+    unseen: tuple[Scene, ...]
+    longest: tuple[int, ...]
+    n_frames: int
+    lag_ps: float
+    velocities: bool
+    equilibrium: bool
+
+    @property
+    def one_molecule(self) -> bool:
+        return len(self.scenes) == 1 and not self.unseen
+
+
+@dataclass(frozen=True)
+class References:
+    """Files to train on. `held`: trajectories that are held out whole, for validation. `spool`: a folder for frames
+    that memory does not hold."""
+
+    paths: tuple[Path, ...]
+    held: tuple[Path, ...] = ()
+    spool: Path | None = None
+
+    @cached_property
+    def survey(self) -> Survey:
+        """Return what the files say of themselves. Raises InputError for a file without topology or times."""
+        files = [_summary(path) for path in (*self.paths, *self.held)]
+        if not self.paths:
+            raise InputError("no trajectory given to train on.")
+        trained, unseen, longest = dict[str, Scene](), dict[str, Scene](), dict[str, int]()
+        for file in files[: len(self.paths)]:
+            key = file.scene.topology_hash
+            trained.setdefault(key, file.scene)
+            longest[key] = max(longest.get(key, 0), file.n_longest)
+        for file in files[len(self.paths) :]:
+            if (key := file.scene.topology_hash) not in trained:
+                unseen.setdefault(key, file.scene)
+        return Survey(
+            scenes=tuple(trained.values()),
+            unseen=tuple(unseen.values()),
+            longest=tuple(longest.values()),
+            n_frames=sum(file.n_frames for file in files[: len(self.paths)]),
+            lag_ps=files[0].lag_ps,
+            velocities=all(file.velocities for file in files),
+            equilibrium=all(file.equilibrium for file in files),
+        )
+
+    def frames(self, *, canonical: bool, velocities: bool = False) -> TrainingFrames:
+        """Return the frames of one molecule, from trajectories or from one windows file.
+
+        Raises InputError for files of several molecules, save intervals or conditions; for windows without the
+        velocities that are asked for; and where a stretch of motion would be both trained on and validated on.
+        """
+        if not any(is_windows(path) for path in self.paths):
+            frames = collect_frames(
+                list(self.paths), canonical=canonical, velocities=velocities, held=list(self.held), spool=self.spool
+            )
+            frames.refuse_leaks()
+            return frames
+        if self.held:
+            raise InputError("`validation` needs trajectories to train on; a windows file keeps its own split.")
+        if len(self.paths) > 1:
+            raise InputError("give either trajectories or one windows file to train on.")
+        frames = load_frames(self.paths[0])
+        if velocities and frames.velocities is None:
+            raise InputError(
+                f"{self.paths[0]} holds no velocities, which this architecture learns from; make it with "
+                "`velocities=True` of `windows`."
+            )
+        frames.refuse_leaks()
+        return frames
+
+    def sets(self) -> FrameSets:
+        """Return the frames of any number of molecules (`collect_sets`)."""
+        return collect_sets(list(self.paths), held=list(self.held), spool=self.spool)
+
+
+@dataclass(frozen=True, eq=False)
+class _FileSummary:
+    scene: Scene
+    n_frames: int
+    n_longest: int
+    lag_ps: float
+    velocities: bool
+    equilibrium: bool
+
+
+def _summary(path: Path) -> _FileSummary:
+    from systems.trajectory.codec import open_trajectory
+
+    if is_windows(path):
+        frames = load_frames(path)
+        longest, moving = int(np.diff(frames.starts).max()), frames.velocities is not None
+        constant = frames.conditions.get("temperature_k") is not None
+        return _FileSummary(frames.scene, frames.n_frames, longest, frames.lag_ps, moving, constant)
+    with open_trajectory(path) as reader:
+        if reader.scene is None:
+            raise InputError(f"{path} carries no topology; give an HDF5 file written by surromd or MDTraj.")
+        times, n_frames = reader.time_ps, reader.n_frames
+        lag_ps = float(times[1] - times[0]) if n_frames > 1 else 0.0
+        moving = n_frames > 0 and reader.read_velocities(0, 1) is not None
+        constant = reader.record.get("kind") == "reference" and reader.record.get("temperature_k") is not None
+        return _FileSummary(reader.scene, n_frames, n_frames, lag_ps, moving, constant)

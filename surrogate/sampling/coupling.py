@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
 import numpy as np
 import numpy.typing as npt
 import torch
 
-from surrogate.data.frames import fitted_atoms
+from surrogate.data import fitted_atoms
 from surrogate.models.potential import Potential
 from surrogate.models.propagator import Molecule
 from systems.chemistry.geometry import superposition
@@ -32,8 +31,7 @@ _SAMPLE_PS = 0.5
 _SAMPLES = 150
 
 
-@dataclass(frozen=True, eq=False)
-class Segment:
+class Segment(NamedTuple):
     """Real MD: frames `(n_frames, n_atoms, 3)` nm and velocities `(n_atoms, 3)` nm/ps at the last, laid on the frame
     that they start from, as the frames of a rollout are."""
 
@@ -59,9 +57,7 @@ class Coupling:
         needed = ("force_field", "solvent", "temperature_k", "timestep_ps")
         missing = [key for key in needed if self._conditions.get(key) is None]
         if missing:
-            raise InputError(
-                f"{_cannot(weights)}: they do not say which {' and '.join(missing)} they were trained with."
-            )
+            raise InputError(f"{_cannot(weights)}: they do not say their {' and '.join(missing)}.")
         try:
             self._spec = resolve(self._scene, ForceFieldSpec.of(self._conditions))
             self._system = build_system(self._scene, self._spec)
@@ -131,18 +127,12 @@ class Coupling:
         from md_reference.run.config import Conditions
         from md_reference.run.engine import Engine
 
-        return Engine(
-            self._scene,
-            Conditions(
-                force=self._spec,
-                temperature_k=self._conditions["temperature_k"],
-                friction_per_ps=self._conditions.get("friction_per_ps") or 1.0,
-                timestep_ps=self._conditions["timestep_ps"],
-                seed=seed,
-                platform=self._platform,
-            ),
-            system=self._system,
-        )
+        c = self._conditions
+        conditions = Conditions(
+            force=self._spec, temperature_k=c["temperature_k"], friction_per_ps=c.get("friction_per_ps") or 1.0,
+            timestep_ps=c["timestep_ps"], seed=seed, platform=self._platform,
+        )  # fmt: skip
+        return Engine(self._scene, conditions, system=self._system)
 
     def close(self) -> None:
         """Free OpenMM's Contexts."""
@@ -158,7 +148,6 @@ def _cannot(weights: Weights) -> str:
 # Whether a frame's energy is one that the reference has: against MD's energies for models of frames, against the
 # reference's own energy of the same frame for a learned potential.
 
-
 # A potential's energy is wrong where it is off by so many times its mean absolute error at held-out states, most of
 # which are hotter than a rollout; it is unsure where its members differ by so many times what they do there. Of
 # paracetamol at 700 K they differ by at most five times that.
@@ -166,16 +155,14 @@ WRONG_TIMES, UNSURE_TIMES = 10.0, 10.0
 
 
 class EnergyCheck(Protocol):
-    """A number in kJ/mol for a frame, kept in the trajectory's scalar `column`, the limit of what passes, and whether a
-    number does not."""
+    """A number in kJ/mol for a frame `(n_atoms, 3)` nm, kept in the trajectory's scalar `column`; infinity where there
+    is none. The `limit` of what passes, and whether a number does not."""
 
     column: str
 
     @property
     def limit(self) -> float: ...
-
     def value(self, frame_nm: FloatArray) -> float: ...
-
     def fails(self, value: float) -> bool: ...
 
 
@@ -192,7 +179,6 @@ class RelaxedEnergy:
         return self._coupling.energy_limit_kj_mol
 
     def value(self, frame_nm: FloatArray) -> float:
-        """Return the energy of a frame `(n_atoms, 3)` nm, infinity where there is none."""
         try:
             return self._coupling.relax(frame_nm).potential_kj_mol
         except SimulationError:
@@ -203,7 +189,7 @@ class RelaxedEnergy:
 
 
 class ReferenceDifference:
-    """U_truth - U_model in kJ/mol of a frame as it is, for a learned potential; by this column the comparison
+    """U_reference - U_model in kJ/mol of a frame as it is, for a learned potential; by this column the comparison
     reweights."""
 
     column = DIFFERENCE_COLUMN
@@ -215,7 +201,6 @@ class ReferenceDifference:
         self.limit = WRONG_TIMES * _measured(weights, "energy_mae")
 
     def value(self, frame_nm: FloatArray) -> float:
-        """Return the difference at a frame `(n_atoms, 3)` nm, infinity where the reference has no answer."""
         frame = np.asarray(frame_nm, dtype=np.float64)
         learned = self._model.evaluate(torch.from_numpy(frame)[None], self._molecule).energy_kj_mol
         try:

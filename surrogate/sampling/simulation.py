@@ -7,29 +7,40 @@ import json
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, BinaryIO, NoReturn
+from typing import Any, BinaryIO, NoReturn
 
 import numpy as np
 import numpy.typing as npt
 import torch
 
-from surrogate.data.shipped import weights_path
+from surrogate.models.architecture import weights_path
 from surrogate.models.potential import Potential
 from surrogate.models.propagator import Molecule
-from surrogate.models.weights import load_weights
+from surrogate.models.weights import Weights, load_weights
 from surrogate.sampling.chunks import ChunkSampler, noise_seed
 from surrogate.sampling.config import RolloutConfig
-from surrogate.sampling.domain import fit_weights, match_scene
-from systems.errors import InputError, SimulationError
+from surrogate.sampling.domain import fit_weights, match_domain
+from systems.errors import InputError, SimulationError, first_line
 from systems.files.outside import UNREADABLE, arrays_in
 from systems.files.schema import parsed
+from systems.files.whole_file import create_whole
+from systems.library.named_scenes import prepare
 from systems.options import from_field, options_as_keywords
 from systems.scene import Scene
 
-if TYPE_CHECKING:
-    from surrogate.models.weights import Weights
+# positions (n_atoms, 3) nm -> potential energy in kJ/mol
+EnergyFn = Callable[[npt.NDArray[np.float64]], float]
 
 # The `openmm.State` of a surrogate: positions, time and energy; velocities and forces are refused by name.
+
+
+def _lacks(what: str) -> Any:
+    """Return a method that refuses what a surrogate does not have."""
+
+    def refuse(*args: Any, **options: Any) -> NoReturn:
+        raise SimulationError(f"a surrogate has no {what}.")
+
+    return refuse
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,7 +54,7 @@ class SurrogateState:
     time_ps: float
     step: int
     include: frozenset[str]
-    energy_fn: Callable[[npt.NDArray[np.float64]], float] | None = None
+    energy_fn: EnergyFn | None = None
 
     def getPositions(self, asNumpy: bool = False) -> Any:
         """Return positions with their unit: `Vec3`s, or an array `(n_atoms, 3)` with `asNumpy`."""
@@ -75,15 +86,6 @@ class SurrogateState:
             raise SimulationError("a surrogate has no potential energy; give the simulation an energy_fn.")
         return float(self.energy_fn(self.positions_nm.astype(np.float64))) * unit.kilojoules_per_mole
 
-    def getKineticEnergy(self) -> NoReturn:
-        raise SimulationError("a surrogate has no kinetic energy (nor total energy, nor temperature); leave it out.")
-
-    def getVelocities(self, asNumpy: bool = False) -> NoReturn:
-        raise SimulationError("a surrogate has no velocities; leave them out.")
-
-    def getForces(self, asNumpy: bool = False) -> NoReturn:
-        raise SimulationError("a surrogate has no forces; leave them out.")
-
     def getParameters(self) -> dict[str, float]:
         """Return no global parameters: there are none."""
         return {}
@@ -92,12 +94,10 @@ class SurrogateState:
         """Return a box that is none; see `NoBox`."""
         return NoBox()
 
-    def getPeriodicBoxVolume(self) -> NoReturn:
-        _no_box()
-
-
-def _no_box() -> NoReturn:
-    raise SimulationError("a surrogate has no periodic box; leave the cell, volume and density out.")
+    getKineticEnergy = _lacks("kinetic energy (nor total energy, nor temperature); leave it out")
+    getVelocities = _lacks("velocities; leave them out")
+    getForces = _lacks("forces; leave them out")
+    getPeriodicBoxVolume = _lacks("periodic box; leave the cell, volume and density out")
 
 
 class NoBox:
@@ -123,35 +123,16 @@ class NoBox:
         return NoBox(is_product=True)
 
     __rmul__ = __mul__
+    _refuse = _lacks("periodic box; leave the cell, volume and density out")
+    __float__ = __pow__ = __truediv__ = __rtruediv__ = __str__ = _refuse
 
     def value_in_unit(self, unit: Any) -> npt.NDArray[np.float64]:
-        if self._is_product:
-            _no_box()
-        return np.zeros((3, 3))
-
-    def __float__(self) -> float:
-        _no_box()
-
-    def __pow__(self, power: float) -> NoReturn:
-        _no_box()
-
-    def __truediv__(self, other: Any) -> NoReturn:
-        _no_box()
-
-    def __rtruediv__(self, other: Any) -> NoReturn:
-        _no_box()
-
-    def __str__(self) -> str:
-        _no_box()
-
-
-# positions (n_atoms, 3) nm -> potential energy in kJ/mol
-EnergyFn = Callable[[npt.NDArray[np.float64]], float]
+        return self._refuse() if self._is_product else np.zeros((3, 3))
 
 
 @dataclass(frozen=True, kw_only=True)
 class SimulationOptions:
-    """What a Simulation can be told of what `rollout` can be told."""
+    """Those of a rollout's options that a Simulation takes."""
 
     seed: int = from_field(RolloutConfig, "seed")
     lag_ps: float | None = from_field(RolloutConfig, "lag_ps")
@@ -164,12 +145,12 @@ class SimulationOptions:
 class Simulation:
     """A learned simulator that OpenMM's and MDTraj's reporters take for `openmm.app.Simulation`.
 
-    One step is one frame of the weights, `integrator.getStepSize()` apart (1 ps, say). `currentStep` may be set.
-    Frames are those that `rollout` writes for the same seed, replica 0, in the scene's atom order and pose. What a
-    surrogate does not have (kinetic energy, temperature, forces, a box) raises SimulationError where it is asked for
-    and is never zero; the potential energy is what `energy_fn` says, and raises without one. Reporters that ask for
-    such things by default must be told not to: `HDF5Reporter(file, 10, cell=False, potentialEnergy=False,
-    kineticEnergy=False, temperature=False)`.
+    One step is one frame of the weights, `integrator.getStepSize()` long. `currentStep` may be set. Frames are those
+    that `rollout` writes for the same seed, replica 0, in the scene's atom order and pose. What a surrogate does not
+    have (kinetic energy, temperature, forces, a box) raises SimulationError where it is asked for and is never zero;
+    the potential energy is what `energy_fn` says, and raises without one. Reporters that ask for such things by default
+    must be told not to: `HDF5Reporter(file, 10, cell=False, potentialEnergy=False, kineticEnergy=False,
+    temperature=False)`.
 
     `scene` and `weights` are what the command line takes, or a Scene and loaded weights.
     `force` runs a scene that leaves the training domain where that is possible; `deviations` then says how. `lag_ps`:
@@ -188,7 +169,9 @@ class Simulation:
         import openmm
         from openmm import unit
 
-        scene, weights = _given(scene, weights)
+        if isinstance(scene, str | Path):
+            scene = prepare(str(scene))
+        weights = _loaded(weights)
         weights, match = fit_weights(scene, weights, force=options.force, lag_ps=options.lag_ps)
         self.scene, self.weights, self.deviations = scene, weights, match.deviations
         self.energy_fn = energy_fn
@@ -199,10 +182,7 @@ class Simulation:
         self.reporters: list[Any] = []
         self.currentStep = 0
         self._sampler = ChunkSampler(
-            weights,
-            solver_steps=options.solver_steps,
-            solver=options.solver,
-            precision=options.precision,
+            weights, solver_steps=options.solver_steps, solver=options.solver, precision=options.precision
         )
         self._seed = options.seed
         self._order, self._back = match.order, np.argsort(match.order)
@@ -243,20 +223,14 @@ class Simulation:
 
     def saveCheckpoint(self, file: str | Path | BinaryIO) -> None:
         """Write where the simulation stands to a path or a binary file, all random numbers to come included."""
-        header = {
-            "settings": self._settings(),
-            "current_step": self.currentStep,
-            "chunks": self._chunks,
-            "frames": self._frames,
-        }
+        header = {"settings": self._settings(), "current_step": self.currentStep, "chunks": self._chunks,
+                  "frames": self._frames}  # fmt: skip
         arrays = {"last": self._last, "current": self._current, "pending": self._pending, "centre": self._centre}
         if self._velocities is not None:
             arrays["velocities"] = self._velocities
         buffer = io.BytesIO()
         np.savez(buffer, allow_pickle=False, header=np.array(json.dumps(header)), **arrays)
         if isinstance(file, str | Path):
-            from systems.files.whole_file import create_whole
-
             create_whole(Path(file), buffer.getvalue())
         else:
             file.write(buffer.getvalue())
@@ -273,8 +247,7 @@ class Simulation:
             settings, counts = header["settings"], [int(header[k]) for k in ("current_step", "chunks", "frames")]
             last, current, pending, centre = (arrays[key] for key in ("last", "current", "pending", "centre"))
         except UNREADABLE as error:
-            reason = " ".join(str(error).split()) or type(error).__name__
-            raise InputError(f"{name} cannot be read as a checkpoint ({reason}); take another.") from error
+            raise InputError(f"{name} cannot be read as a checkpoint ({first_line(error)}); take another.") from error
         for key, value in self._settings().items():
             if settings.get(key) != value:
                 raise InputError(f"{name} was saved with {key} = {settings.get(key)!r}, not {value!r}.")
@@ -282,9 +255,7 @@ class Simulation:
         self._velocities = arrays.get("velocities")
         self.currentStep, self._chunks, self._frames = counts
 
-    def minimizeEnergy(self, *args: Any, **options: Any) -> None:
-        """Raise SimulationError: a surrogate has no energy to minimise."""
-        raise SimulationError("a surrogate has no energy to minimise; prepare the scene, or minimise it with OpenMM.")
+    minimizeEnergy = _lacks("energy to minimise; prepare the scene, or minimise it with OpenMM")
 
     def _settings(self) -> dict[str, Any]:
         return {
@@ -336,13 +307,8 @@ class Simulation:
         self._chunks += 1
 
     def _state(self, include: frozenset[str]) -> SurrogateState:
-        return SurrogateState(
-            positions_nm=self.positions_nm,
-            time_ps=self._frames * self.lag_ps,
-            step=self.currentStep,
-            include=include,
-            energy_fn=self.energy_fn,
-        )
+        time_ps = self._frames * self.lag_ps
+        return SurrogateState(self.positions_nm, time_ps, self.currentStep, include, self.energy_fn)
 
 
 class SurrogateIntegrator:
@@ -410,17 +376,8 @@ _PROPERTIES = {
 }  # fmt: skip
 
 
-def _given(scene: str | Path | Scene, weights: str | Path | Weights) -> tuple[Scene, Weights]:
-    if isinstance(scene, str | Path):
-        from systems.library.named_scenes import prepare
-
-        scene = prepare(str(scene))
-    if isinstance(weights, str | Path):
-        from surrogate.data.shipped import weights_path
-        from surrogate.models.weights import load_weights
-
-        weights = load_weights(weights_path(weights))
-    return scene, weights
+def _loaded(weights: str | Path | Weights) -> Weights:
+    return load_weights(weights_path(weights)) if isinstance(weights, str | Path) else weights
 
 
 def _described(report: Any) -> dict[str, Any]:
@@ -447,14 +404,14 @@ class LearnedForces:
     """
 
     def __init__(self, scene: Scene, weights: str | Path | Weights) -> None:
-        loaded = load_weights(weights_path(weights)) if isinstance(weights, str | Path) else weights
+        loaded = _loaded(weights)
         if not isinstance(loaded.model, Potential):
             raise InputError(
                 f"{loaded.path.name} makes frames, not forces ({loaded.model.arch}); train a potential with "
                 "`level='gfn2-xtb'`."
             )
         self.scene, self.weights, self._model = scene, loaded, loaded.model.eval()
-        self._order = match_scene(scene, loaded)
+        self._order = match_domain(scene, loaded).order
         self._back = np.argsort(self._order)
         self._molecule = Molecule.of(loaded.domain.scene)
 
@@ -478,9 +435,7 @@ class LearnedForces:
         import openmm
 
         if not hasattr(openmm, "PythonForce"):
-            raise InputError(
-                f"a learned force needs OpenMM's PythonForce, which {openmm.__version__} lacks; update it."
-            )
+            raise InputError(f"a learned force needs OpenMM's PythonForce; {openmm.__version__} has none, update it.")
 
         def compute(state: Any) -> tuple[float, FloatArray]:
             return self(np.asarray(state.getPositions(asNumpy=True)._value, dtype=np.float64))
@@ -505,9 +460,7 @@ class LearnedForces:
                 if tuple(atoms.get_chemical_symbols()) != tuple(learned.scene.elements):
                     raise InputError(f"these atoms are not those of {learned.scene.name!r}, in its order.")
                 energy, forces = learned(atoms.get_positions() * NM_PER_ANGSTROM)
-                self.results = {
-                    "energy": energy / KJ_MOL_PER_EV,
-                    "forces": forces * (NM_PER_ANGSTROM / KJ_MOL_PER_EV),
-                }
+                per_angstrom = NM_PER_ANGSTROM / KJ_MOL_PER_EV
+                self.results = {"energy": energy / KJ_MOL_PER_EV, "forces": forces * per_angstrom}
 
         return Learned()

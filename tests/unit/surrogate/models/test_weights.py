@@ -1,20 +1,49 @@
-"""After training a model that takes the lag forgets its start as fast as the reference does at that lag."""
+"""Weights files whose record is wrong, and models that learn several lags."""
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from lag_errors import _correlation
+from safetensors import safe_open
+from safetensors.torch import load_file, save_file
 
-from surrogate.data.frames import TrainingFrames, canonicalise, quantise
-from surrogate.models.lam_slide.network import ApproximatorConfig, AutoencoderConfig, LamSlideConfig
+from surrogate.data import TrainingFrames, canonicalise, quantise
+from surrogate.models.lam_slide.model import ApproximatorConfig, AutoencoderConfig, LamSlideConfig
 from surrogate.models.lam_slide.trainer import TrainingConfig, train_lam_slide
-from surrogate.models.weights import load_weights
+from surrogate.models.weights import Weights, load_weights
 from surrogate.sampling.chunks import ChunkSampler
 from surrogate.sampling.domain import fit_weights
+from surrogate.training.loop import tensor_checksum
+from systems.errors import WeightsError
 from systems.prepare.molecule import scene_from_smiles
+
+
+def record_of(path: Path) -> dict[str, Any]:
+    with safe_open(path, framework="pt") as handle:
+        return json.loads(handle.metadata()["surromd"])
+
+
+def forged(path: Path, record: Any, tensors: dict[str, Any]) -> Path:
+    text = json.dumps(record)
+    metadata = {"format": "surromd-weights-1", "surromd": text, "sha256": tensor_checksum(text, tensors)}
+    save_file(tensors, path, metadata=metadata)
+    return path
+
+
+@pytest.mark.parametrize(("part", "key", "value"), [("approximator", "n_layers", 10_000),
+                                                    ("approximator", "width", 10**9)])  # fmt: skip
+def test_a_model_that_its_file_cannot_hold(small_weights: Weights, tmp_path: Path, part: str, key: str,
+                                           value: int) -> None:  # fmt: skip
+    record = record_of(small_weights.path)
+    record["config"][part][key] = value
+    with pytest.raises(WeightsError, match=f"{key} = {value} in a file of"):
+        load_weights(forged(tmp_path / "w.safetensors", record, load_file(small_weights.path)))
+
 
 MEMORY = 0.95
 

@@ -1,12 +1,11 @@
-"""Training of PAINET as a potential: it asks an expensive reference about the states it is least sure of, and learns.
+"""Training of PAINET as a potential, by active learning from an expensive reference.
 
 States come from hot MD and turned torsions (the labeller's `explore`), then from the model's own rollouts. Members of
-the potential learn from different samples; where their forces spread most, the reference is asked next.
+the potential learn from different samples; states where their forces spread most are labelled next.
 """
 
 from __future__ import annotations
 
-import json
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
@@ -17,33 +16,21 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from surrogate.data.references import References
-from surrogate.models.architecture import Architecture, Prepared, Settings, Trainer, TrainingRequest
-from surrogate.models.painet.potential.energy import PotentialConfig
-from surrogate.models.painet.potential.model import PainetPotential
+from surrogate.data import References
+from surrogate.models import architecture as arch
+from surrogate.models.painet.energy import PainetPotential, PotentialConfig
 from surrogate.models.propagator import Molecule
 from surrogate.models.weights import TrainingDomain, provenance_of, save_weights
+from surrogate.training import loop
 from surrogate.training.devices import StepThreads, torch_threads
-from surrogate.training.loop import (
-    ProgressFn,
-    Stage,
-    StageConfig,
-    append_row,
-    read_curves,
-    tensor_checksum,
-    train_stages,
-)
 from systems.chemistry.graph import turn_torsions
 from systems.chemistry.validity import WIDENING, geometry_from_frames, limits_from_frames
 from systems.errors import InputError, SimulationError
-from systems.files.schema import parsed
-from systems.files.whole_file import create_whole
 from systems.scene import Scene
 from systems.units import GAS_CONSTANT_KJ_MOL_K
 
 # States with energies and forces: what a potential learns from, kept in a file of its own.
 
-Array = Any
 # So far above the lowest state, for each atom, that no rollout comes there: the potential energy of 1,200 K.
 _HIGHEST_KJ_MOL = 15.0
 
@@ -53,60 +40,43 @@ class Samples:
     """`positions_nm` and `forces_kj_mol_nm` (n, n_atoms, 3), `energies_kj_mol` (n,), in float64; `held` (n,): whether a
     sample is kept for measuring errors and never trained on."""
 
-    positions_nm: Array
-    energies_kj_mol: Array
-    forces_kj_mol_nm: Array
-    held: Array
+    positions_nm: Any
+    energies_kj_mol: Any
+    forces_kj_mol_nm: Any
+    held: Any
 
     def __len__(self) -> int:
         return len(self.energies_kj_mol)
 
     def joined(self, other: Samples) -> Samples:
         """Return both, without what lies too high above the lowest."""
-        parts = [np.concatenate([getattr(self, f.name), getattr(other, f.name)]) for f in fields(Samples)]
-        together = Samples(*parts)
-        return together.plausible(together)
+        parts = (np.concatenate([getattr(self, f.name), getattr(other, f.name)]) for f in fields(Samples))
+        return (together := Samples(*parts)).plausible(together)
 
     def plausible(self, others: Samples) -> Samples:
         """Return those of the others that a rollout may visit, by how far they lie above the lowest of these."""
         highest = self.energies_kj_mol.min(initial=np.inf) + _HIGHEST_KJ_MOL * self.positions_nm.shape[1]
         return others.where(others.energies_kj_mol < highest)
 
-    def where(self, chosen: Array) -> Samples:
+    def where(self, chosen: Any) -> Samples:
         """Return those that are chosen, by a mask or by numbers."""
         return Samples(*(getattr(self, f.name)[chosen] for f in fields(Samples)))
 
-    def tensors(self) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    def tensors(self) -> tuple[Tensor, Tensor, Tensor]:
         """Return positions, energies and forces."""
-        return tuple(torch.from_numpy(np.ascontiguousarray(a)) for a in (
-            self.positions_nm, self.energies_kj_mol, self.forces_kj_mol_nm))  # type: ignore[return-value]  # fmt: skip
+        x, energies, forces, _ = (torch.from_numpy(np.ascontiguousarray(getattr(self, f.name))) for f in fields(self))
+        return x, energies, forces
 
     def save(self, path: Path, molecule: str) -> None:
         """Write them whole or not at all; `molecule`: whose they are."""
-        from safetensors.torch import save_file
-
-        tensors = {f.name: torch.from_numpy(np.ascontiguousarray(getattr(self, f.name))) for f in fields(Samples)}
-        text = json.dumps({"molecule": molecule})
-        metadata = {"surromd_samples": text, "sha256": tensor_checksum(text, tensors)}
-        create_whole(path, lambda temporary: save_file(tensors, temporary, metadata=metadata))
+        tensors = {f.name: torch.from_numpy(np.ascontiguousarray(getattr(self, f.name))) for f in fields(self)}
+        loop.save_tensors(path, "surromd_samples", {"molecule": molecule}, tensors)
 
     @staticmethod
     def load(path: Path, molecule: str) -> Samples:
         """Read them back. Raises InputError for a damaged file or another molecule's."""
-        from safetensors import SafetensorError, safe_open
-
-        try:
-            with safe_open(path, framework="pt") as handle:
-                metadata = handle.metadata() or {}
-                tensors = {f.name: handle.get_tensor(f.name) for f in fields(Samples)}
-            text = metadata["surromd_samples"]
-            whole = metadata["sha256"] == tensor_checksum(text, tensors)
-            whose = parsed(text)["molecule"]
-        except (SafetensorError, OSError, ValueError, KeyError, TypeError) as error:
-            raise InputError(f"samples {path} cannot be read ({error}); train again without `resume`.") from error
-        if not whole:
-            raise InputError(f"samples {path} are damaged (checksum); train again without `resume`.")
-        if whose != molecule:
+        record, tensors = loop.load_tensors(path, "surromd_samples")
+        if record.get("molecule") != molecule:
             raise InputError(f"samples {path} are of another molecule; train again without `resume`.")
         return Samples(**{name: tensor.numpy() for name, tensor in tensors.items()})
 
@@ -116,13 +86,9 @@ class Samples:
         return Samples(empty, np.zeros(0), empty, np.zeros(0, dtype=bool))
 
 
-# What weights of a potential cover: how frames look at its reference, and how far they move from one to the next.
-
-
 def domain_of(scene: Scene, samples: Samples, moving: list[Any], config: PotentialConfig) -> TrainingDomain:
-    """Return what the weights cover: the reference's quieter samples say what frames look like; runs of cheap MD,
-    `moving` (n, n_atoms, 3) each, how far they move from one to the next, hot ones since hydroxyls turn at their own
-    rate."""
+    """Return what the weights cover: what frames look like by the reference's quieter samples, and how far they move
+    from one to the next by runs of cheap MD, `moving` (n, n_atoms, 3) each, hot ones among them."""
     conditions = {
         "force_field": "gfn2-xtb", "solvent": "vacuum", "temperature_k": config.temperature_k,
         "friction_per_ps": config.friction_per_ps, "timestep_ps": config.timestep_ps,
@@ -140,11 +106,11 @@ def domain_of(scene: Scene, samples: Samples, moving: list[Any], config: Potenti
     return TrainingDomain(scene, config.lag_ps, conditions, geometry.to_dict(), limits.to_dict(), ())
 
 
-# The share of the budget in which states are asked for; what is missing then is asked for at once, unless a pause or a
+# The share of the budget in which states are labelled; what is missing then is labelled at once, unless a pause or a
 # resumption has brought the training so far that it would hardly learn them.
-_ASKING_SHARE, _LAST_ASKING_SHARE = 0.4, 0.7
+_LABELLING_SHARE, _LAST_LABELLING_SHARE = 0.4, 0.7
 # Most of the budget that new states and their answers may take.
-_ANSWERING_SHARE = 0.3
+_LABELLING_TIME_SHARE = 0.3
 # Fewer new states than this are not worth a round.
 _FEWEST = 8
 # Least share of it that is for steps, whatever stands before and after them.
@@ -164,19 +130,9 @@ _OWN_STEP_PS = 0.0005
 _MOVING_FRAMES = 200
 
 
-class Answers(Protocol):
-    """States with energies and forces, without those at which the reference finds no answer."""
-
-    @property
-    def positions_nm(self) -> Any: ...
-    @property
-    def energies_kj_mol(self) -> Any: ...
-    @property
-    def forces_kj_mol_nm(self) -> Any: ...
-
-
 class ReferenceForces(Protocol):
-    """An expensive reference about one molecule (md_reference.run.labeller.Teacher is one)."""
+    """An expensive reference of one molecule's forces, as `md_reference.run.labeller` has it. `label` returns states
+    with `positions_nm`, `energies_kj_mol` and `forces_kj_mol_nm`, without those at which it finds no answer."""
 
     @property
     def scene(self) -> Scene: ...
@@ -187,15 +143,15 @@ class ReferenceForces(Protocol):
         self, n_frames: int, lag_ps: float, temperature_k: float, *, seed: int, constrain_hydrogens: bool = False
     ) -> Any: ...
 
-    def label(self, positions_nm: Any) -> Answers: ...
+    def label(self, positions_nm: Any) -> Any: ...
 
 
 @dataclass(frozen=True)
 class PotentialTraining:
-    """Training settings. `first` states are asked for at once, then more in `rounds` up to `most`, until the mean
+    """Training settings. `first` states are labelled at once, then more in `rounds` up to `most`, until the mean
     absolute error of held-out forces is below `tolerance_kj_mol_nm`; `held_share` of them is never learned. `budget_s`:
-    of wall time for all that it takes, from the first states to the weights. `matrix_rate`: learning rate of matrices,
-    by Muon. `energy_weight`: of energies beside forces in the loss. `temperatures_k`: of hot MD and own rollouts."""
+    wall time of all that it takes, from the first states to the weights. `matrix_rate`: learning rate of matrices, by
+    Muon. `energy_weight`: of energies beside forces in the loss. `temperatures_k`: of hot MD and own rollouts."""
 
     budget_s: float | None = None
     steps: int | None = None
@@ -224,7 +180,8 @@ class PotentialTraining:
 
 
 class Learner:
-    """A potential, its samples and its labeller: `loss` learns and asks, `errors` measures on held-out states."""
+    """A potential, its samples and its reference: `loss` learns, and labels new states when they are due; `errors`
+    measures on held-out states."""
 
     def __init__(
         self, model: PainetPotential, reference: ReferenceForces, config: PotentialTraining, out: Path, *, resume: bool
@@ -240,23 +197,23 @@ class Learner:
         self._threads = StepThreads(1 if config.budget_s is None else torch.get_num_threads())
         self._spent_s, self._steps = 0.0, 0
         curves = out.with_suffix(".csv")
-        if resume and curves.exists() and (rows := [row for rows in read_curves(curves).values() for row in rows]):
+        if resume and curves.exists() and (rows := [row for rows in loop.read_curves(curves).values() for row in rows]):
             self._spent_s, self._steps = float(rows[-1]["spent_s"]), int(rows[-1]["step"])
         if resume and self.path.exists():
             self.samples = Samples.load(self.path, self.key)
         else:
             self.rounds_path.unlink(missing_ok=True)
         self._budget_s, self._started = config.budget_s, time.monotonic()
-        self._asking = True
-        self._asking_s, self._asked = 0.0, 0
+        self._labelling = True
+        self._labelling_s, self._labelled = 0.0, 0
         if len(self.samples):
-            self._take()
+            self._use()
         else:
             began = time.monotonic()
-            self._learn(
+            self._label(
                 reference.explore(config.first, config.temperatures_k, seed=config.seed), held=config.held_share
             )
-            self._asking_s, self._asked = time.monotonic() - began, config.first
+            self._labelling_s, self._labelled = time.monotonic() - began, config.first
         # Samples may be all that an interrupted training left; a state that it left brings its own.
         _, energies, forces = self.samples.tensors()
         model.set_scales(energies, forces)
@@ -278,7 +235,7 @@ class Learner:
         """Mean length of the error of an atom's force, in units of the typical force, and mean square error of
         energies. A length, since squares would have a few strained states outweigh all others. Each sample of a batch
         is answered by one of the members that learn from it."""
-        self._ask_if_due(generator)
+        self._label_if_due(generator)
         self._steps += 1
         self._threads.next_step()
         model, c = self.model, self.config
@@ -298,7 +255,7 @@ class Learner:
     def errors(self) -> dict[str, float]:
         """Errors on held-out states: of forces in kJ/mol/nm, mean absolute and root mean square, beside the mean
         absolute force, and of energies (less their mean) in kJ/mol, beside the members' spread there; how many states
-        have been asked for."""
+        have been labelled."""
         numbers = np.flatnonzero(self.samples.held)
         some = np.linspace(0, len(numbers) - 1, min(len(numbers), _MEASURED)).astype(int)
         held = self.samples.where(numbers[some])
@@ -319,28 +276,27 @@ class Learner:
             "energy_spread": float(torch.cat([part.members_kj_mol for part in parts]).std(-1, correction=0).mean()),
         }
 
-    def _ask_if_due(self, generator: torch.Generator) -> None:
+    def _label_if_due(self, generator: torch.Generator) -> None:
         c, share = self.config, self.share
-        have, last = len(self.samples), share >= _ASKING_SHARE
-        if not self._asking or have >= c.most or self.error_kj_mol_nm < c.tolerance_kj_mol_nm:
+        have, last = len(self.samples), share >= _LABELLING_SHARE
+        if not self._labelling or have >= c.most or self.error_kj_mol_nm < c.tolerance_kj_mol_nm:
             return
         growth = (c.most / c.first) ** (1.0 / c.rounds)
-        due = c.most if last else c.first * growth ** (c.rounds * share / _ASKING_SHARE)
+        due = c.most if last else c.first * growth ** (c.rounds * share / _LABELLING_SHARE)
         if due < min(have * growth, c.most):
             return
         n = round(due) - have
-        if self._budget_s is not None and self._asking_s:
+        if self._budget_s is not None and self._labelling_s:
             # As many as the time that is left for them allows, at the pace so far.
-            left_s = _ANSWERING_SHARE * self._budget_s - self._asking_s
-            n = min(n, round(left_s / self._asking_s * self._asked))
-        self._asking = not last and n >= _FEWEST
-        if n < _FEWEST or share > _LAST_ASKING_SHARE:
+            left_s = _LABELLING_TIME_SHARE * self._budget_s - self._labelling_s
+            n = min(n, round(left_s / self._labelling_s * self._labelled))
+        self._labelling = not last and n >= _FEWEST
+        if n < _FEWEST or share > _LAST_LABELLING_SHARE:
             return
-        self._ask(n, generator)
+        self._label_more(n, generator)
 
-    def _ask(self, n: int, generator: torch.Generator) -> None:
-        """Ask about `n` states of own rollouts and, fewer, of hot MD: any of them, and as many where members spread
-        most."""
+    def _label_more(self, n: int, generator: torch.Generator) -> None:
+        """Label `n` states of own rollouts and, fewer, of hot MD: half of them where members spread most."""
         began = time.monotonic()
         seed = int(torch.randint(2**31, (), generator=generator))
         own = self._own_states(max(_REPLICAS, n // _OWN_FRAMES), seed)
@@ -351,13 +307,13 @@ class Learner:
         rest = pool[order[n // 2 :]]
         spread = self.spread(torch.from_numpy(rest))
         unsure = rest[np.argsort(-spread)[: n - len(any_)]]
-        self._learn(any_, held=2 * self.config.held_share, measured=True)
-        self._learn(unsure, held=0.0)
-        self._asking_s, self._asked = self._asking_s + time.monotonic() - began, self._asked + n
+        self._label(any_, held=2 * self.config.held_share, measured=True)
+        self._label(unsure, held=0.0)
+        self._labelling_s, self._labelled = self._labelling_s + time.monotonic() - began, self._labelled + n
 
     def spread(self, positions_nm: Tensor) -> Any:
-        """Root mean square deviation of the members' forces from their mean, the largest of a state's atoms, `(n,)` in
-        kJ/mol/nm."""
+        """Root mean square deviation of the members' forces from their mean, the largest of each state's atoms, `(n,)`
+        in kJ/mol/nm."""
         parts = [self.model.member_forces(part, self.fabric) for part in positions_nm.double().split(256)]
         deviation = torch.cat([(p - p.mean(0)).square().sum(-1).mean(0).sqrt().amax(-1) for p in parts])
         return torch.nan_to_num(deviation, nan=0.0).numpy()
@@ -384,8 +340,8 @@ class Learner:
         found = torch.cat(frames)
         return found[torch.isfinite(found).all(-1).all(-1) & (found.abs().amax((1, 2)) < 10.0)].numpy()
 
-    def _learn(self, states: Any, *, held: float, measured: bool = False) -> None:
-        """Ask about states and take the answers; `measured`: note the error before they are learned."""
+    def _label(self, states: Any, *, held: float, measured: bool = False) -> None:
+        """Label states and learn from them; `measured`: note the error before."""
         answers = self.reference.label(states)
         n = len(answers.energies_kj_mol)
         if not n:
@@ -396,12 +352,12 @@ class Learner:
         new = Samples(answers.positions_nm, answers.energies_kj_mol, answers.forces_kj_mol_nm, kept)
         if measured:
             row = {"evaluations": len(self.samples), "share": self.share, **self._measured(self.samples.plausible(new))}
-            append_row(self.rounds_path, row)
+            loop.append_row(self.rounds_path, row)
         self.samples = self.samples.joined(new)
         self.samples.save(self.path, self.key)
-        self._take()
+        self._use()
 
-    def _take(self) -> None:
+    def _use(self) -> None:
         learned = self.samples.where(~self.samples.held)
         if len(learned) < 2 or not self.samples.held.any():
             raise SimulationError(f"too few states of {self.reference.scene.name!r} have an answer to learn from.")
@@ -420,13 +376,11 @@ def samples_path(out: Path) -> Path:
 
 def learn_potential(
     reference: ReferenceForces, out: Path, model_config: PotentialConfig, config: PotentialTraining, *,
-    resume: bool = False, progress: ProgressFn | None = None, before_s: float = 0.0, after_s: float = 0.0,
+    resume: bool = False, progress: loop.ProgressFn | None = None, before_s: float = 0.0, after_s: float = 0.0,
 ) -> Path:  # fmt: skip
     """Learn a molecule's energies and forces and write weights `out`; beside them stay the samples, the curves (.csv)
-    and the error of forces against evaluations, round by round (NAME.rounds.csv).
-
-    Of the budget `before_s` are spent already, and `after_s` are wanted by whoever called, for later.
-    """
+    and the error of forces against evaluations, round by round (NAME.rounds.csv). Of the budget `before_s` are spent
+    already, and `after_s` are wanted by the caller, for later."""
     began = time.monotonic() - before_s
     torch.manual_seed(config.seed)
     model = PainetPotential(model_config)
@@ -443,13 +397,14 @@ def learn_potential(
     if budget_s is not None:
         left_s = budget_s - (time.monotonic() - began) - after_s
         budget_s = max(left_s, _LEARNING_SHARE * budget_s)
-    stage = StageConfig("potential", config.batch, config.learning_rate, budget_s, config.steps,
+    stage = loop.StageConfig("potential", config.batch, config.learning_rate, budget_s, config.steps,
                         matrix_rate=config.matrix_rate, seed=config.seed, bf16=False,
                         validate_every_s=config.validate_every_s)  # fmt: skip
 
     def advance(name: str, share: float, metrics: dict[str, float]) -> None:
+        error = f", force error {learner.error_kj_mol_nm:.3g} kJ/mol/nm" if np.isfinite(learner.error_kj_mol_nm) else ""
         if progress is not None:
-            progress(_line(learner), share, metrics)
+            progress(f"{len(learner.samples)} evaluations{error}", share, metrics)
 
     def write(spent_s: list[float]) -> None:
         domain = domain_of(reference.scene, learner.samples, moving, model_config)
@@ -460,35 +415,27 @@ def learn_potential(
         save_weights(out, model.eval(), domain, provenance_of(origin, settings))
 
     learner.begin(budget_s)
-    stages = [Stage(model, stage, learner.loss, learner.errors, saves=False)]
+    stages = [loop.Stage(model, stage, learner.loss, learner.errors, saves=False)]
     with torch_threads(1):
-        train_stages(stages, out, write, device=torch.device("cpu"), resume=resume, progress=advance)
+        loop.train_stages(stages, out, write, device=torch.device("cpu"), resume=resume, progress=advance)
     return out
 
 
-def _line(learner: Learner) -> str:
-    n = len(learner.samples)
-    if not np.isfinite(learner.error_kj_mol_nm):
-        return f"{n} evaluations"
-    return f"{n} evaluations, force error {learner.error_kj_mol_nm:.3g} kJ/mol/nm"
-
-
-class PotentialTrainer(Trainer):
+class PotentialTrainer(arch.Trainer):
     """Refuses trajectories, which say too little about forces; `learn` takes a molecule and its reference."""
 
-    def check(self, request: TrainingRequest) -> None:
+    def check(self, request: arch.TrainingRequest) -> None:
         raise _no_trajectories(request)
 
-    def settings(self, request: TrainingRequest) -> Settings:
+    def settings(self, request: arch.TrainingRequest) -> arch.Settings:
         """See `Trainer.settings`."""
-        asked = {"budget_s": request.budget_s, "steps": request.steps, "seed": request.seed, "device": request.device}
-        training = request.settings(PotentialTraining, asked)
-        return Settings(PotentialConfig.from_dict(request.model), training, frozenset(asked))
+        training = request.settings(PotentialTraining)
+        return arch.Settings(PotentialConfig.from_dict(request.model), training, arch.RESOLVED)
 
-    def prepare(self, references: References, request: TrainingRequest) -> Prepared:
+    def prepare(self, references: References, request: arch.TrainingRequest) -> arch.Prepared:
         raise _no_trajectories(request)
 
-    def learn(self, reference: ReferenceForces, request: TrainingRequest, advance: Callable[[str, float], None], *,
+    def learn(self, reference: ReferenceForces, request: arch.TrainingRequest, advance: Callable[[str, float], None], *,
               before_s: float = 0.0, after_s: float = 0.0) -> Path:  # fmt: skip
         """Learn a molecule from its reference, as the request has it, and return the weights; see `learn_potential`."""
         settings = self.settings(request)
@@ -498,11 +445,11 @@ class PotentialTrainer(Trainer):
         )  # fmt: skip
 
 
-def _no_trajectories(request: TrainingRequest) -> InputError:
+def _no_trajectories(request: arch.TrainingRequest) -> InputError:
     return InputError(
         f"{request.arch} learns from forces that are computed for it; give a molecule, `arch='painet'` and "
         "`level='gfn2-xtb'`."
     )
 
 
-PAINET_POTENTIAL = Architecture("painet-potential", PotentialConfig.from_dict, PainetPotential, PotentialTrainer)
+PAINET_POTENTIAL = arch.Architecture("painet-potential", PotentialConfig.from_dict, PainetPotential, PotentialTrainer)
