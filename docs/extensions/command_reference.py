@@ -55,9 +55,10 @@ def _plain(text: str) -> str:
 
 def file_rows(words: list[str]) -> list[tuple[str, str]]:
     """Return (table and key, what it says) of each option of a verb that the command line has no flag for."""
-    from surrogate.verbs.options import VERB_OPTIONS, verb_option_rows
+    from surrogate.verbs.options import VERB_OPTIONS
+    from systems.options import option_rows
 
-    rows = verb_option_rows(words[0]) if words[0] in VERB_OPTIONS else []
+    rows = option_rows(VERB_OPTIONS[words[0]]) if words[0] in VERB_OPTIONS else []
     found = []
     for row in (row for row in rows if not row.flag):
         choices = f" One of {', '.join(row.choices)}." if row.choices else ""

@@ -86,7 +86,7 @@ def test_without_ambertools_a_run_ends_in_one_line_and_peptides_are_run(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     for place in ("gaff", "programs"):
-        monkeypatch.setattr(f"md_reference.forces.small_molecules.{place}.find_ambertools", lambda: None)
+        monkeypatch.setattr(f"md_reference.forces.{place}.find_ambertools", lambda: None)
     monkeypatch.setenv("SURROMD_CACHE", str(tmp_path / "cache"))
     for resume in (False, True):
         with pytest.raises(PreparationError, match="GAFF2 parameters need AmberTools") as caught:

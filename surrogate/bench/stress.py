@@ -11,16 +11,15 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from surrogate.bench.machine import machine_facts
-from surrogate.bench.stress import odd_inputs, other_arithmetic
-from surrogate.bench.stress.frame_statistics import Frames, measure_drift, measure_validity
-from surrogate.bench.stress.stress_page import write_stress
+from surrogate.bench import stress_trials
+from surrogate.bench.stress_page import Frames, measure_drift, measure_validity, write_stress
+from surrogate.bench.timing import machine_facts
 from systems.chemistry.validity import INVALID, Geometry, check_frames
 from systems.errors import InputError, SimulationError, StorageError, SurromdError, nearest
 from systems.trajectory.codec import open_trajectory
 
 if TYPE_CHECKING:
-    from surrogate.bench.stress.stress_options import StressOptions
+    from surrogate.bench.bench_options import StressOptions
     from surrogate.models.weights import Weights
 
 SECTIONS = ("length", "invariance", "inputs", "precision", "batches", "solvers", "openmm")
@@ -73,7 +72,7 @@ def stress_weights(
     weights: str | Path, folder: Path, config: StressConfig, *, scene: str | None = None,
     report: ReportFn = lambda name: None,
 ) -> dict[str, Any]:  # fmt: skip
-    """Run a stress test of weights, by name or file, and write its tables and plot into `folder`; return its rows.
+    """Run a stress test of weights, by name or file, and write its tables into `folder`; return its rows.
 
     Weights of several peptides are tried on `scene` (`systems.library.named_scenes`), or the first that they were
     trained on. Raises SurromdError for weights that cannot be loaded or do not cover the scene and a folder that
@@ -104,9 +103,9 @@ def run_stress(weights: Weights, folder: Path, config: StressConfig, *, report: 
     """Run the sections and return their rows, JSON-able; rollouts stay in `folder` and are resumed when run again.
     Weights are for one molecule (`sampling.domain.fit_weights`).
 
-    Tables, plot and JSON are written anew after each section, so that what is done survives an interruption; sections
-    that an earlier run of the same weights left in `folder` stay where this one does not run them. `report` is told of
-    each section as it begins. Raises SurromdError where a rollout cannot be written.
+    Tables and JSON are written anew after each section, so that what is done survives an interruption; sections
+    that an earlier run of the same weights left in `folder` stay where this one does not run them. `report` is
+    called with each section as it begins. Raises SurromdError where a rollout cannot be written.
     """
     result: dict[str, Any] = {
         "weights": weights.path.name,
@@ -122,8 +121,10 @@ def run_stress(weights: Weights, folder: Path, config: StressConfig, *, report: 
     for name in (s for s in SECTIONS if s in config.sections):
         report(name)
         rows = _RUN[name](weights, folder, config)
-        if name == "length":
-            rows = _with_other_lengths(sections.get(name, []), rows)
+        if name == "length":  # beside earlier ones of another guard or length
+            done = {(row["guard"], row.get("asked")) for row in rows}
+            rows += [row for row in sections.get(name, []) if (row["guard"], row.get("asked")) not in done]
+            rows.sort(key=lambda row: (row["guard"], row.get("asked", 0)))
         sections[name] = rows
         result["sections"] = {s: sections[s] for s in SECTIONS if s in sections}
         write_stress(result, folder)
@@ -133,19 +134,10 @@ def run_stress(weights: Weights, folder: Path, config: StressConfig, *, report: 
 def _earlier_sections(folder: Path, weights: Weights) -> dict[str, list[dict[str, Any]]]:
     try:
         found = json.loads((folder / "stress.json").read_text(encoding="utf-8"))
-        same = found["weights_hash"] == weights.hash and found.get("scene", weights.domain.scene.name) == (
-            weights.domain.scene.name
-        )
+        same = found["weights_hash"] == weights.hash and found["scene"] == weights.domain.scene.name
         return dict(found["sections"]) if same else {}
     except (OSError, ValueError, LookupError, TypeError):
         return {}
-
-
-def _with_other_lengths(earlier: list[dict[str, Any]], new: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Return the new rows among the earlier ones of another guard or length."""
-    done = {(row["guard"], row.get("asked")) for row in new}
-    rows = [row for row in earlier if (row["guard"], row.get("asked")) not in done] + new
-    return sorted(rows, key=lambda row: (row["guard"], row.get("asked", 0)))
 
 
 def _length(weights: Weights, folder: Path, config: StressConfig) -> list[dict[str, Any]]:
@@ -173,28 +165,25 @@ def _one_length(weights: Weights, folder: Path, config: StressConfig, n_frames: 
     geometry = Geometry.from_dict(weights.domain.geometry)
     replicas: list[Frames] = []
     unmarked = chunks = caught = 0
-    draw_s = check_s = help_s = 0.0
+    seconds: dict[str, float] = {}
     for path in outs:
         with open_trajectory(path) as reader:
-            frames = reader.read()
-            flags = reader.flags
-            summary, cost = reader.record["interventions"], reader.record.get("cost", {})
-        replicas.append(frames)
-        bad = (check_frames(frames, geometry) & np.uint16(INVALID)) != 0
-        unmarked += int(np.count_nonzero(bad & ((flags & np.uint16(INVALID)) == 0))) if flags is not None else len(bad)
+            replicas.append(reader.read())
+            flags = np.zeros(reader.n_frames, np.uint16) if reader.flags is None else reader.flags.astype(np.uint16)
+            summary, row["wall_s"] = reader.record["interventions"], reader.record.get("cost", {}).get("batch_wall_s")
+        bad = (check_frames(replicas[-1], geometry) & np.uint16(INVALID)) != 0
+        unmarked += int(np.count_nonzero(bad & ((flags & np.uint16(INVALID)) == 0)))
         chunks, caught = chunks + summary["chunks"], caught + summary["chunks_caught"]
-        seconds = summary["seconds"]
-        draw_s, check_s = seconds.get("draw", 0.0), seconds.get("check", 0.0)
-        help_s = sum(spent for of, spent in seconds.items() if of not in ("draw", "check"))
-        row["wall_s"] = cost.get("batch_wall_s")
+        seconds = dict(summary["seconds"])
     if min(map(len, replicas)) == 0:
         return row
+    draw_s, check_s = max(seconds.pop("draw", 0.0), 1e-9), seconds.pop("check", 0.0)
     row |= measure_validity(replicas, geometry, lag_ps).to_dict()
     row |= {
         "invalid_unmarked": unmarked,
         "chunks_helped_%": 100.0 * caught / max(chunks, 1),
-        "checks_%": 100.0 * check_s / max(draw_s, 1e-9),
-        "help_%": 100.0 * help_s / max(draw_s, 1e-9),
+        "checks_%": 100.0 * check_s / draw_s,
+        "help_%": 100.0 * sum(seconds.values()) / draw_s,
     }
     return row | {"drift": measure_drift(replicas, scene, geometry) | _energy_drift(weights, replicas)}
 
@@ -226,18 +215,16 @@ def _energy_drift(weights: Weights, replicas: list[Frames]) -> dict[str, Any]:
     return out
 
 
-def _invariance(weights: Weights, folder: Path, config: StressConfig) -> list[dict[str, Any]]:
-    return [row for kind in ("fp32", "bf16") for row in odd_inputs.measure_invariance(weights, precision=kind, seed=1)]
-
-
 _RUN: dict[str, Callable[[Any, Path, StressConfig], list[dict[str, Any]]]] = {
     "length": _length,
-    "invariance": _invariance,
-    "inputs": lambda w, _, c: odd_inputs.measure_odd_inputs(w, chunks=max(2, c.chunks // 2), seed=c.seed),
-    "precision": lambda w, _, c: other_arithmetic.measure_precision(w, compiled=c.compiled, seed=c.seed),
-    "batches": lambda w, _, c: other_arithmetic.measure_batches(
-        w, seed=c.seed, batches=other_arithmetic.BATCHES if c.compiled else other_arithmetic.BATCHES[:2]
+    "invariance": lambda w, _, c: [
+        row for kind in ("fp32", "bf16") for row in stress_trials.measure_invariance(w, precision=kind, seed=1)
+    ],
+    "inputs": lambda w, _, c: stress_trials.measure_odd_inputs(w, chunks=max(2, c.chunks // 2), seed=c.seed),
+    "precision": lambda w, _, c: stress_trials.measure_precision(w, compiled=c.compiled, seed=c.seed),
+    "batches": lambda w, _, c: stress_trials.measure_batches(
+        w, seed=c.seed, batches=stress_trials.BATCHES if c.compiled else stress_trials.BATCHES[:2]
     ),
-    "solvers": lambda w, _, c: other_arithmetic.measure_solvers(w, chunks=c.chunks, seed=c.seed),
-    "openmm": lambda w, _, c: other_arithmetic.measure_openmm(w, n_frames=c.openmm_frames, seed=c.seed),
+    "solvers": lambda w, _, c: stress_trials.measure_solvers(w, chunks=c.chunks, seed=c.seed),
+    "openmm": lambda w, _, c: stress_trials.measure_openmm(w, n_frames=c.openmm_frames, seed=c.seed),
 }
