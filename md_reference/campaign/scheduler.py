@@ -16,7 +16,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 from md_reference.campaign.campaign_file import JOB_LOGS, Campaign, Run, SceneSpec, default_of, first_seed, key_of
 from md_reference.campaign.cluster import poll, result_of, stop
@@ -212,7 +212,7 @@ class _Job:
         self._collect()
         for name in {name for runs in self._active.values() for name in runs}:
             if self.manifest.runs[name].status == WAITING:
-                self._note("runs", name, status=RUNNING)
+                self._note(self.manifest.runs, name, status=RUNNING)
         if not self._is_written and time.monotonic() > self._write_at:
             began = time.monotonic()
             write_manifest(self._campaign.folder, self.manifest)
@@ -233,9 +233,9 @@ class _Job:
         while self._out and time.monotonic() < deadline:
             time.sleep(_TICK_S)
             self._collect(again=False)
-        for name, entry in self.manifest.runs.items():
+        for name, entry in list(self.manifest.runs.items()):
             if entry.status == RUNNING:
-                self._note("runs", name, status=WAITING)
+                self._note(self.manifest.runs, name, status=WAITING)
 
     def progress(self) -> CampaignProgress:
         """Return how far the campaign is; an active run counts the frames that its worker last reported."""
@@ -308,19 +308,20 @@ class _Job:
     def _done(self, task: SceneSpec | Run, attempt: int, **entries: Any) -> None:
         if isinstance(task, Run):
             attempts = self.manifest.runs[task.name].attempts + attempt
-            self._note("runs", task.name, attempts=attempts, **entries)
+            self._note(self.manifest.runs, task.name, attempts=attempts, **entries)
             return
-        self._note("scenes", task.name, **entries)
+        self._note(self.manifest.scenes, task.name, **entries)
         for run in self._runs[task.name]:
             if entries["status"] == COMPLETE:
                 self._submit(run)
             else:
-                self._note("runs", run.name, status=FAILED, reason=f"scene {task.name}: {entries['reason']}")
+                self._note(
+                    self.manifest.runs, run.name, status=FAILED, reason=f"scene {task.name}: {entries['reason']}"
+                )
 
-    def _note(self, table: Literal["scenes", "runs"], name: str, **entries: Any) -> None:
-        old: dict[str, Any] = getattr(self.manifest, table)
-        changed: dict[str, Any] = {table: {**old, name: replace(old[name], **entries)}}
-        self.manifest, self._is_written = replace(self.manifest, **changed), False
+    def _note(self, table: dict[str, Any], name: str, **entries: Any) -> None:
+        table[name] = replace(table[name], **entries)
+        self._is_written = False
 
 
 def _work(token: str, folder: Path, name: str, *given: Any) -> dict[str, Any]:

@@ -20,7 +20,7 @@ from systems.scene import IntArray, Scene, once_per_scene, part_of
 # Energies of the model systems, in kJ/mol; lengths in nm.
 _LAWS = {
     "harmonic": "0.5*(kx*x^2+ky*y^2+kz*z^2)",
-    "double-well": "barrier_kj_mol*((x/minimum_nm)^2-1)^2+tilt_kj_mol_nm*x+0.5*transverse_kj_mol_nm2*(y^2+z^2)",
+    "double-well": "barrier_kj_mol*((x/minimum_nm)^2-1)^2 + tilt_kj_mol_nm*x + 0.5*transverse_kj_mol_nm2*(y^2+z^2)",
 }
 
 

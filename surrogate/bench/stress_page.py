@@ -114,7 +114,7 @@ TITLES = {
     "inputs": "Inputs pushed out of the training domain",
     "precision": "Arithmetic: the first chunk against float64",
     "batches": "Batch size: the first replica against the same alone",
-    "solvers": "Solver steps, and chunks kept in part",
+    "solvers": "Solver steps",
     "openmm": "OpenMM itself, by the same criteria",
 }
 _LEFT_TO_JSON = ("asked", "drift")

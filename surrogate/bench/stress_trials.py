@@ -1,11 +1,11 @@
-"""What a stress test tries: inputs that a rollout was not made for (moved, noisy, strained, hot, mirrored, permuted,
+"""What a stress test tries: inputs that a rollout was not made for (moved, noisy, strained, mirrored, permuted,
 with other atoms), other arithmetic and settings, and OpenMM under other time steps, all by the same criteria."""
 
 from __future__ import annotations
 
 import copy
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
@@ -31,7 +31,6 @@ if TYPE_CHECKING:
 
 NOISE_NM = (0.001, 0.003, 0.01, 0.03, 0.1)
 _ROWS = 8
-_HOT_K = 50.0
 SOLVER_STEPS = (2, 5, 10, 20, 40)
 BATCHES = (1, 8, 64, 512)
 TIMESTEPS_PS = (0.001, 0.002, 0.004, 0.005)
@@ -86,9 +85,6 @@ def odd_scenes(weights: Weights, seed: int) -> Iterator[tuple[str, Scene]]:
     clashing = x.copy()
     clashing[i] = x[j] + [0.02, 0.0, 0.0]
     yield "clashing: two far atoms 0.02 nm apart", scene.with_positions(clashing)
-    hot = _hot_frame(weights, seed)
-    if hot is not None:
-        yield f"{_HOT_K:g} K too hot, from MD", scene.with_positions(hot)
     broken = x.copy()
     broken[0, 0] = np.nan
     yield "a coordinate that is no number", scene.with_positions(broken)
@@ -127,17 +123,6 @@ def measure_odd_inputs(weights: Weights, *, chunks: int = 4, seed: int = 0) -> l
                 row[key] = 100.0 * (1.0 - found.broken / found.frames)
         rows.append(row)
     return rows
-
-
-def _hot_frame(weights: Weights, seed: int) -> FloatArray | None:
-    """A frame `(n_atoms, 3)` nm of MD at 50 K more than the training's, None for weights that OpenMM cannot follow."""
-    try:
-        timestep_ps = weights.domain.conditions["timestep_ps"]
-        with openmm_of(weights.domain, timestep_ps, seed, hotter_k=_HOT_K) as engine:
-            engine.step(round(5.0 / timestep_ps))
-            return engine.positions()
-    except (KeyError, SurromdError):
-        return None
 
 
 # ---- other arithmetic and settings ----------------------------------------------------------------------------------
@@ -194,25 +179,19 @@ def measure_batches(weights: Weights, *, seed: int = 0, batches: tuple[int, ...]
 
 
 def measure_solvers(weights: Weights, *, chunks: int, seed: int = 0) -> list[dict[str, Any]]:
-    """Return validity and bonds from coarse to fine: solver steps of each solver, and chunks of which only a part is
-    kept (so that the surrogate is asked anew after fewer frames)."""
+    """Return validity and bonds from coarse to fine: at solver steps of each solver."""
     geometry = Geometry.from_dict(weights.domain.geometry)
-    whole = weights.model.n_new
-    cases: list[tuple[str | None, int, int]] = [
-        (solver, steps, whole) for solver in weights.model.solvers for steps in SOLVER_STEPS
-    ]
-    default = weights.model.solvers[0] if weights.model.solvers else None
-    parts = sorted({max(1, whole // part) for part in (8, 4, 2)})
-    cases += [(default, 20, part) for part in parts]
+    solvers: Sequence[str] = weights.model.solvers
+    cases: list[tuple[str | None, int]]
+    cases = [(solver, steps) for solver in solvers for steps in SOLVER_STEPS]
     rows = []
-    for solver, steps, kept in cases:
+    for solver, steps in cases or [(None, 1)]:
         sampler = ChunkSampler(weights, solver=solver, solver_steps=steps)
         started = time.process_time()
-        frames = Roller(weights, sampler, rows=_ROWS, seed=seed).advance(chunks * whole, kept)
+        frames = Roller(weights, sampler, rows=_ROWS, seed=seed).advance(chunks * sampler.n_new)
         speed = _frames_per_cpu_s(frames, started)
-        row = {"solver": solver or "none", "steps": steps if solver else 1, "frames_kept_of_chunk": kept}
         bonds = measure_bonds(frames.reshape(-1, *frames.shape[2:]), geometry)
-        rows.append(row | _valid(frames, geometry) | bonds | speed)
+        rows.append({"solver": solver or "none", "steps": steps, **_valid(frames, geometry), **bonds, **speed})
     return rows
 
 

@@ -63,17 +63,15 @@ class Roller:
         self._velocities: npt.NDArray[np.floating] | None = None
         self._chunk = 0
 
-    def advance(self, n_frames: int, kept: int | None = None) -> Frames:
-        """Return `(rows, n_frames, n_atoms, 3)` nm, of each chunk the first `kept` frames (all). What a last chunk has
-        beyond `n_frames` is lost: the next call goes on from that chunk's end."""
-        each = kept or self._sampler.n_new
+    def advance(self, n_frames: int) -> Frames:
+        """Return `(rows, n_frames, n_atoms, 3)` nm. What a last chunk has beyond `n_frames` is lost: the next call goes
+        on from that chunk's end."""
         parts: list[Frames] = []
-        for _ in range(-(-n_frames // each)):
-            # Velocities belong to a chunk's end; where it is cut, the model draws new ones.
+        for _ in range(-(-n_frames // self._sampler.n_new)):
             seeds = [noise_seed(self._seed, row, self._chunk) for row in range(self._rows)]
             drawn = self._sampler.draw(self._last, seeds, self._velocities)
-            self._velocities = drawn.velocities_nm_ps if each == self._sampler.n_new else None
-            parts.append(drawn.frames_nm[:, :each].astype(np.float64))
+            self._velocities = drawn.velocities_nm_ps
+            parts.append(drawn.frames_nm.astype(np.float64))
             self._last = np.concatenate([self._last, parts[-1]], axis=1)[:, -self._sampler.n_conditioning :]
             self._chunk += 1
         return np.concatenate(parts, axis=1)[:, :n_frames]
@@ -165,8 +163,8 @@ def _spread(values: Sequence[float], shares: Sequence[float] | None = None) -> d
 
 
 @contextmanager
-def openmm_of(domain: TrainingDomain, timestep_ps: float, seed: int, *, hotter_k: float = 0.0) -> Iterator[Engine]:
-    """Yield OpenMM under the conditions of training, `hotter_k` above their temperature, minimised and with velocities.
+def openmm_of(domain: TrainingDomain, timestep_ps: float, seed: int) -> Iterator[Engine]:
+    """Yield OpenMM under the conditions of training, minimised and with velocities.
 
     Raises KeyError where the domain does not say one of these, and what `Engine` raises.
     """
@@ -177,7 +175,7 @@ def openmm_of(domain: TrainingDomain, timestep_ps: float, seed: int, *, hotter_k
     given = domain.conditions
     conditions = Conditions(
         force=resolve(domain.scene, ForceFieldSpec.of(given)),
-        temperature_k=given["temperature_k"] + hotter_k,
+        temperature_k=given["temperature_k"],
         friction_per_ps=given.get("friction_per_ps") or 1.0,
         timestep_ps=timestep_ps,
         seed=seed,
