@@ -180,9 +180,6 @@ _WATER_FILES = {
               "charmm36": "charmm36/water.xml"},
     "opc": {"ff14SB": "amber14/opc.xml", "ff19SB": "amber19/opc.xml", "ff99SB-ILDN": "amber14/opc.xml"},
 }  # fmt: skip
-# (cut-off, start of the switching function or None), nm: Amber's and CHARMM's own practice.
-CUTOFFS_NM = {"charmm36": (1.2, 1.0)}
-DEFAULT_CUTOFF_NM: tuple[float, float | None] = (0.9, None)
 
 
 def water_file(protein: str, solvent: str) -> str | None:
@@ -196,8 +193,9 @@ def chain_files(protein: str) -> tuple[str, ...]:
 
 
 def cutoff_nm(protein: str) -> tuple[float, float | None]:
-    """Return the cut-off of direct interactions in a periodic cell and where it starts to act, in nm."""
-    return CUTOFFS_NM.get(protein, DEFAULT_CUTOFF_NM)
+    """Return the cut-off of direct interactions in a periodic cell and where switching starts, in nm: Amber's and
+    CHARMM's own practice."""
+    return (1.2, 1.0) if protein == "charmm36" else (0.9, None)
 
 
 @cache

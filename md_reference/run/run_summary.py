@@ -114,9 +114,7 @@ def summary_lines(summary: dict[str, Any]) -> list[str]:
 
 def _with_error(value: dict[str, Any], unit: str) -> str:
     error = value.get("standard_error")
-    if error is None:
-        return f"{value['mean']:.4g} {unit}"
-    if error <= 0 or not math.isfinite(error):
-        return f"{value['mean']:.6g} {unit}"
+    if error is None or error <= 0 or not math.isfinite(error):
+        return f"{value['mean']:.{4 if error is None else 6}g} {unit}"
     digits = max(0, 1 - math.floor(math.log10(error)))
     return f"{value['mean']:.{digits}f} ± {error:.{digits}f} {unit}"

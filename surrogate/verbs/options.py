@@ -30,14 +30,6 @@ def tell(name: str, line: str) -> None:
     sys.stderr.write(f"{name}: {said.get()(line)}\n")
 
 
-def _one_or_none(text: str, what: str) -> str | None:
-    return None if text == "-" else text
-
-
-def _parse_dt_ps(text: str, what: str) -> float | None:
-    return None if text == "-" else parse_time_ps(text, what)
-
-
 @dataclass(frozen=True, kw_only=True)
 class Seeded:
     seed: int = option("Random seed.", 0, within=(0, None))
@@ -153,12 +145,14 @@ class CompareOptions(Overwriting):
 
     replicate: Trajectories | None = option("Independent reference run, for the replicate baseline.", None)
     top: PathLike | Sequence[PathLike | None] | None = option(
-        "Topology file: one for all, or one each for REF, every TRAJ and the replicate.", None, read=_one_or_none
+        "Topology file: one for all, or one each for REF, every TRAJ and the replicate.",
+        None,
+        read=lambda text, what: None if text == "-" else text,
     )
     dt_ps: float | Sequence[float | None] | None = option(
         "Time between frames, where a file does not say; as the topology. '-' leaves one out.",
         None,
-        read=_parse_dt_ps,
+        read=lambda text, what: None if text == "-" else parse_time_ps(text, what),
     )
     labels: str | Sequence[str] | None = option("Names of the candidates in the report.", None, words=None)
     energies: bool = option("Also compare potential energies, by the reference's force field.", False)

@@ -12,16 +12,18 @@ import pytest
 
 from md_reference.run.engine import Engine
 from surrogate.bench.bench_options import StressOptions
-from surrogate.bench.stress import StressConfig, choose_config, run_stress
-from surrogate.bench.stress_page import markdown, measure_bonds, measure_drift, measure_validity
-from surrogate.bench.stress_trials import (
+from surrogate.bench.stress import (
+    StressConfig,
+    choose_config,
     measure_batches,
     measure_invariance,
     measure_odd_inputs,
     measure_openmm,
     measure_precision,
     openmm_of,
+    run_stress,
 )
+from surrogate.bench.stress_page import markdown, measure_bonds, measure_drift, measure_validity
 from surrogate.models.weights import Weights
 from systems.chemistry.graph import molecule_key
 from systems.chemistry.validity import Geometry, geometry_from_frames
@@ -158,7 +160,7 @@ def test_openmm_moves_in_every_frame_under_the_constraints_of_the_reference(
         usual(engine, n_steps)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("surrogate.bench.stress_trials.DISCARDED_PS", 0.05)
+        patch.setattr("surrogate.bench.stress.DISCARDED_PS", 0.05)
         patch.setattr(Engine, "step", step)
         assert measure_openmm(replace(small_weights, domain=domain), n_frames=4)[0]["timestep_fs"] == 1.0
     assert taken[:5] == [50, 1, 1, 1, 1] and min(taken) == 1
