@@ -202,11 +202,8 @@ def key_of(name: str) -> str:
 
 
 def read_settings(table: dict[str, Any], *, others: Iterable[str] = (), where: str = "") -> Settings:
-    """Return a table's settings, in our units.
-
-    Raises InputError for a key that is unknown (with the nearest that is known; `others` are keys the caller has read),
-    ValueError for values of the wrong kind.
-    """
+    """Return a table's settings, in our units. Raises InputError for a key that is unknown (with the nearest that is
+    known; `others` are keys the caller has read), ValueError for values of the wrong kind."""
     hints = get_type_hints(MDConfig) | get_type_hints(ForceFieldSpec)
     by_key = {key_of(name): name for name in _known_fields()}
     found = Settings({}, {}, {})

@@ -83,11 +83,8 @@ def scene_path(folder: Path, name: str) -> Path:
 def prepare_scene(
     token: str, folder: Path, spec: SceneSpec, config: MDConfig, seed: int, replicas: int = 1
 ) -> dict[str, Any]:
-    """Prepare a scene, or take the one that lies in `scenes/NAME.json`, and return its summary.
-
-    `config`: of any of its runs, which share all but temperature and seed; `seed`: of the water around it;
-    `replicas`: how many begin apart.
-    """
+    """Prepare a scene, or take the one that lies in `scenes/NAME.json`, and return its summary. `config`: of any of its
+    runs, which share all but temperature and seed; `seed`: of the water around it; `replicas`: how many begin apart."""
     path = scene_path(folder, spec.name)
 
     def prepared() -> PreparedScene:
@@ -139,10 +136,8 @@ def load_prepared(path: Path) -> PreparedScene:
 
 
 def simulate_run(token: str, folder: Path, run: Run, checkpoint_every_s: float, expected: str) -> dict[str, Any]:
-    """Simulate a run, or go on with it, and return what the manifest says of it when it is complete.
-
-    `expected`: the hash of its frames, where the manifest already has one.
-    """
+    """Simulate a run, or go on with it, and return what the manifest says of it when it is complete. `expected`: the
+    hash of its frames, where the manifest already has one."""
     return guarded(token, folder / MANIFEST_NAME, lambda: _simulate(token, folder, run, checkpoint_every_s, expected))
 
 

@@ -26,9 +26,7 @@ _LAWS = {
 
 def build_model_system(scene: Scene) -> Any:
     """Return the `openmm.System` of a scene with `interactions`: particles with the scene's masses, one custom force.
-
-    No constraints, no cell, no centre-of-mass removal. Raises InputError for a law that is unknown or incomplete.
-    """
+    No constraints, no cell, no centre-of-mass removal. Raises InputError for a law that is unknown or incomplete."""
     from openmm import CustomExternalForce, System
 
     law = dict(scene.interactions or {})

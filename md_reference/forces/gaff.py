@@ -104,10 +104,8 @@ def shipped_path(scene: Scene) -> Path:
 
 
 def store(path: Path, made: Entry) -> Entry:
-    """Write an entry and return what lies there: of several processes that compute the same, the first one's stays.
-
-    The file appears whole or not at all. Raises StorageError when it cannot be written.
-    """
+    """Write an entry and return what lies there: of several processes that compute the same, the first one's stays. The
+    file appears whole or not at all. Raises StorageError when it cannot be written."""
     scene = replace(made.scene, provenance={}).to_dict()
     record = {"format": _FORMAT, "source": made.source, "scene": scene, "prmtop": made.prmtop}
     data = gzip.compress(sealed(json.dumps(record, sort_keys=True)).encode(), mtime=0)
@@ -383,10 +381,8 @@ CHARGE_UNIT = 18.2223
 
 
 class Prmtop:
-    """The sections of a prmtop file: `fields[name]` is a list of numbers or of strings, in the file's own units.
-
-    Raises InputError for text that is no prmtop of this kind (one molecule, no polarisability, no CMAP).
-    """
+    """The sections of a prmtop file: `fields[name]` is a list of numbers or of strings, in the file's own units. Raises
+    InputError for text that is no prmtop of this kind (one molecule, no polarisability, no CMAP)."""
 
     def __init__(self, text: str) -> None:
         self.fields: dict[str, list[Any]] = {}

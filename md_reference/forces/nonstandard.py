@@ -62,10 +62,8 @@ class Chain:
 
 
 def find_chain(scene: Scene) -> Chain | None:
-    """Return a molecule of which ff14SB covers some amino acids, divided into residues; None where it covers none.
-
-    A cysteine bonded to a residue without a template is one with it.
-    """
+    """Return a molecule of which ff14SB covers some amino acids, divided into residues; None where it covers none. A
+    cysteine bonded to a residue without a template is one with it."""
     force_field = force_field_of(CHAIN_FILES)
     uncut: set[tuple[int, int]] = set()
     while True:
@@ -90,9 +88,7 @@ def find_chain(scene: Scene) -> Chain | None:
 
 def build_chain(scene: Scene, spec: ForceFieldSpec) -> Any:
     """Return the `openmm.System`, in vacuum, of a molecule that `find_chain` finds a chain in; particles in its order.
-
-    Raises PreparationError where GAFF2 or AM1-BCC cannot describe a residue, or a term is left without parameters.
-    """
+    Raises PreparationError where GAFF2 or AM1-BCC cannot describe a residue, or a term is left without parameters."""
     from openmm import app
 
     chain = find_chain(scene)
@@ -161,10 +157,8 @@ class CappedResidue:
 
 
 def cap(scene: Scene, residue: int) -> CappedResidue:
-    """Return a residue with the atoms up to two bonds beyond it, hydrogens closing the cuts.
-
-    Inside a chain of amides that is ACE-X-NME. Raises PreparationError when it fits no Lewis structure.
-    """
+    """Return a residue with the atoms up to two bonds beyond it, hydrogens closing the cuts. Inside a chain of amides
+    that is ACE-X-NME. Raises PreparationError when it fits no Lewis structure."""
     near = scene.neighbours()
     kept = [i for i in range(scene.n_atoms) if scene.residue_of_atom[i] == residue]
     n_own = len(kept)
@@ -224,10 +218,7 @@ def _unit(vector: Any) -> FloatArray:
 
 def make_template(capped: CappedResidue, name: str) -> tuple[str, float]:
     """Return the template of a capped residue's own atoms, in their order, as XML of an OpenMM force field, and the
-    charge (e) that was spread over them.
-
-    Raises PreparationError where GAFF2 or AM1-BCC cannot describe it.
-    """
+    charge (e) that was spread over them. Raises PreparationError where GAFF2 or AM1-BCC cannot describe it."""
     from openmm import app
 
     scene = capped.scene

@@ -81,10 +81,8 @@ def run_program(
 
 @contextmanager
 def scratch_folder(prefix: str) -> Iterator[Path]:
-    """Yield a new folder among the system's temporary ones; it goes with the block, and with this process.
-
-    Raises StorageError where it cannot be made. Where there is no shell (Windows) it goes with the block alone.
-    """
+    """Yield a new folder among the system's temporary ones; it goes with the block, and with this process. Raises
+    StorageError where it cannot be made. Where there is no shell (Windows) it goes with the block alone."""
     if os.name != "posix":
         with tempfile.TemporaryDirectory(prefix=prefix) as name:
             yield Path(name)

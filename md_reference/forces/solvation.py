@@ -112,10 +112,8 @@ def require_molecules(spec: ForceFieldSpec) -> None:
 def solvate_if_asked(
     scene: Scene, spec: ForceFieldSpec, *, seed: int = 0, temperature_k: float = 300.0, **box: float | None
 ) -> Scene:
-    """Return the scene in water where `spec.solvent` is explicit and it has no cell yet, else as it is.
-
-    `box`: fields of `WaterBox`, None for their defaults. Raises InputError for one that nothing would use.
-    """
+    """Return the scene in water where `spec.solvent` is explicit and it has no cell yet, else as it is. `box`: fields
+    of `WaterBox`, None for their defaults. Raises InputError for one that nothing would use."""
     given = {name: value for name, value in box.items() if value is not None}
     if spec.is_explicit and scene.cell_nm is None:
         return solvate(scene, spec, WaterBox(**given), seed=seed, temperature_k=temperature_k)

@@ -144,10 +144,8 @@ class ForceFieldSpec:
 
 
 def at_level(level: str | None, force_field: str | None) -> str | None:
-    """Return the force field that a level of theory ('mm', 'gfn2-xtb' or None) leaves or demands.
-
-    Raises UnknownNameError, and InputError where the two contradict each other.
-    """
+    """Return the force field that a level of theory ('mm', 'gfn2-xtb' or None) leaves or demands. Raises
+    UnknownNameError, and InputError where the two contradict each other."""
     if level is None:
         return force_field
     if level not in ("mm", QUANTUM):

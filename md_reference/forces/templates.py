@@ -259,10 +259,8 @@ def _describe(scene: Scene, residue: int) -> str:
 
 
 def native_obc2(topology: Any, system: Any) -> Any:
-    """OBC2 (Onufriev, Bashford and Case 2004, igb=5) as GBSAOBCForce.
-
-    Charges from the NonbondedForce, radii (mbondi2) and scales from OpenMM's standard OBC2 table.
-    """
+    """OBC2 (Onufriev, Bashford and Case 2004, igb=5) as GBSAOBCForce. Charges from the NonbondedForce, radii (mbondi2)
+    and scales from OpenMM's standard OBC2 table."""
     from openmm import GBSAOBCForce
     from openmm.app.internal.customgbforces import GBSAOBC2Force
 

@@ -91,11 +91,8 @@ def settings_of(config: MDConfig) -> dict[str, Any]:
 
 
 def check_same_run(old: dict[str, Any], config: MDConfig, out: Path, *, ignoring: tuple[str, ...] = ()) -> None:
-    """Raise InputError unless a record or a checkpoint states the settings of `config`.
-
-    A setting that an older version did not know counts as its default. A run may be resumed to become longer, never
-    shorter.
-    """
+    """Raise InputError unless a record or a checkpoint states the settings of `config`. A setting that an older version
+    did not know counts as its default. A run may be resumed to become longer, never shorter."""
     before = settings_of(MDConfig(time_ps=config.time_ps)) | old
     for key, value in json.loads(json.dumps(settings_of(config))).items():
         if key not in ("time_ps", *ignoring) and before.get(key) != value:
@@ -135,10 +132,8 @@ def resolved(scene: Scene, config: MDConfig) -> MDConfig:
 
 
 def check_run(scene: Scene, config: MDConfig, out: Path) -> MDConfig:
-    """Return the settings `resolved` for this scene, before anything is computed.
-
-    Raises UnitError for uneven intervals, InputError for what `out` cannot hold or the scene cannot have.
-    """
+    """Return the settings `resolved` for this scene, before anything is computed. Raises UnitError for uneven
+    intervals, InputError for what `out` cannot hold or the scene cannot have."""
     _ = config.steps_per_frame
     config = resolved(scene, config)
     kept = config.kept_atoms(scene)

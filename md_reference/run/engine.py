@@ -307,9 +307,7 @@ def integrator_name(ensemble: str) -> str:
 
 def _velocity_verlet(timestep_ps: float, *, constrained: bool) -> Any:
     """Return velocity Verlet (Swope et al., J. Chem. Phys. 76, 637 (1982)), with RATTLE where bonds are constrained.
-
-    Unlike those of OpenMM's VerletIntegrator, a leapfrog, its velocities belong to the same time as its positions.
-    """
+    Unlike those of OpenMM's VerletIntegrator, a leapfrog, its velocities belong to the same time as its positions."""
     import openmm
 
     integrator = openmm.CustomIntegrator(timestep_ps)
@@ -339,11 +337,8 @@ class Relaxed:
 
 
 class Relaxer:
-    """One Context with a spring on each atom. Use as a context manager or call `close`.
-
-    `system`: an OpenMM System of `scene` as `build_system` returns it; it is copied. Raises SimulationError when the
-    platform cannot run it.
-    """
+    """One Context with a spring on each atom. Use as a context manager or call `close`. `system`: an OpenMM System of
+    `scene` as `build_system` returns it; it is copied. Raises SimulationError when the platform cannot run it."""
 
     def __init__(self, scene: Scene, system: Any, *, platform: str = "auto", born: bool = True) -> None:
         import openmm
@@ -363,10 +358,8 @@ class Relaxer:
             self._context: Any = make_context(self._system, self._integrator, choice.name, choice.threads)
 
     def relax(self, positions_nm: npt.ArrayLike) -> Relaxed:
-        """Restore constrained bonds exactly, then minimise under the springs until converged.
-
-        Raises SimulationError where the energy is not finite before or after, as with atoms on top of each other.
-        """
+        """Restore constrained bonds exactly, then minimise under the springs until converged. Raises SimulationError
+        where the energy is not finite before or after, as with atoms on top of each other."""
         import openmm
 
         start = np.asarray(positions_nm, dtype=np.float64)

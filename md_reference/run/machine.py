@@ -305,10 +305,8 @@ def measured_platform(
 def choose_fastest(
     timings: list[Timing], by_size: PlatformChoice, *, n_atoms: int, side_by_side: int = 1
 ) -> PlatformChoice:
-    """Return the platform with the shortest step; the size rule's where there is no timing.
-
-    More threads are taken where they are 1.2 times faster. A device is shared by the replicas that run side by side.
-    """
+    """Return the platform with the shortest step; the size rule's where there is no timing. More threads are taken
+    where they are 1.2 times faster. A device is shared by the replicas that run side by side."""
     cost = {
         t: t.us_per_step * (side_by_side if t.platform in _DEVICES else 1) for t in timings if t.us_per_step is not None
     }

@@ -131,10 +131,8 @@ def make_plan(scene: Scene, config: MDConfig, *, replicas: int = 1, timed: bool 
 
 
 def _time_simd_s(scene: Scene, config: MDConfig, system: Any) -> float:
-    """Return the seconds of processor time of one step of all replicas, the fastest of all batches measured.
-
-    Raises SimdUnavailableError, and SimulationError where the replicas differ from OpenMM or cannot be stepped.
-    """
+    """Return the seconds of processor time of one step of all replicas, the fastest of all batches measured. Raises
+    SimdUnavailableError, and SimulationError where the replicas differ from OpenMM or cannot be stepped."""
     run = SimdReplicas(
         system,
         temperature_k=config.temperature_k,

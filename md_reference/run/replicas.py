@@ -106,10 +106,8 @@ class _Batch(StoredRun):
         self, starts_nm: npt.NDArray[np.floating] | None, asked_to_stop: Callable[[], bool],
         progress: ProgressFn | None,
     ) -> None:  # fmt: skip
-        """Go to where the batch was left, or to the starts, and equilibrate.
-
-        Raises SimulationError, KeyboardInterrupt.
-        """
+        """Go to where the batch was left, or to the starts, and equilibrate. Raises SimulationError,
+        KeyboardInterrupt."""
         if self.resumed:
             self.simd.restore(self.blob)
             return

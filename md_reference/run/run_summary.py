@@ -42,10 +42,8 @@ def mean_and_error(values: npt.ArrayLike) -> dict[str, float | None]:
 
 
 def drift(time_ps: npt.ArrayLike, energy_kj_mol: npt.ArrayLike, n_dof: int) -> dict[str, float | None]:
-    """Return the slope of the total energy by least squares, kJ/mol per ns and degree of freedom, and its error.
-
-    The residuals are correlated: their statistical inefficiency widens the error of the slope.
-    """
+    """Return the slope of the total energy by least squares, kJ/mol per ns and degree of freedom, and its error. The
+    residuals are correlated: their statistical inefficiency widens the error of the slope."""
     t = np.asarray(time_ps, dtype=np.float64) * 1e-3
     energy = np.asarray(energy_kj_mol, dtype=np.float64) / max(n_dof, 1)
     if len(t) < 3:

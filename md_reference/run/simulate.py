@@ -115,9 +115,7 @@ class Stand:
 
 class StoredRun:
     """Replicas on their way (one, or a batch with one checkpoint): what is done, since when, what their files say.
-
-    Raises InputError for a checkpoint that is not of this run.
-    """
+    Raises InputError for a checkpoint that is not of this run."""
 
     def __init__(
         self, scene: Scene, config: MDConfig, outs: Sequence[Path], kept: Checkpoint | None, *, overwrite: bool

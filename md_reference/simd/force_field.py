@@ -117,10 +117,8 @@ def _program(width: int | None = None) -> ctypes.CDLL:
 
 
 def n_replicas() -> int:
-    """How many replicas a batch has: 16, 8 or 4, what a register of this processor holds.
-
-    Raises SimdUnavailableError.
-    """
+    """How many replicas a batch has: 16, 8 or 4, what a register of this processor holds. Raises
+    SimdUnavailableError."""
     return int(_program().replicas())
 
 

@@ -304,10 +304,8 @@ def odd_scenes(weights: Weights, seed: int) -> Iterator[tuple[str, Scene]]:
 
 
 def measure_odd_inputs(weights: Weights, *, chunks: int = 4, seed: int = 0) -> list[dict[str, Any]]:
-    """Return of each odd input: refused or not and why, and what becomes of it when it is forced.
-
-    `first_%` and `last_%`: frames that obey the 0.5 Å rule in the first and the last of `chunks`, over eight replicas.
-    """
+    """Return of each odd input: refused or not and why, and what becomes of it when it is forced. `first_%` and
+    `last_%`: frames that obey the 0.5 Å rule in the first and the last of `chunks`, over eight replicas."""
     sampler = ChunkSampler(weights)
     geometry = Geometry.from_dict(weights.domain.geometry)
     rows = []
@@ -336,9 +334,7 @@ def measure_odd_inputs(weights: Weights, *, chunks: int = 4, seed: int = 0) -> l
 
 def measure_precision(weights: Weights, *, compiled: bool, seed: int = 0) -> list[dict[str, Any]]:
     """Return of each arithmetic how far its first chunk is from float64's, from the training template, eight replicas.
-
-    `deviation_nm` is the greatest coordinate, `rms_nm` the root mean square; validity is that of this one chunk.
-    """
+    `deviation_nm` is the greatest coordinate, `rms_nm` the root mean square; validity is that of this one chunk."""
     inputs = _Inputs(weights, _ROWS, seed)
     geometry = Geometry.from_dict(weights.domain.geometry)
     rows: list[dict[str, Any]] = []

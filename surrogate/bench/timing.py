@@ -164,10 +164,8 @@ def _spread(values: Sequence[float], shares: Sequence[float] | None = None) -> d
 
 @contextmanager
 def openmm_of(domain: TrainingDomain, timestep_ps: float, seed: int) -> Iterator[Engine]:
-    """Yield OpenMM under the conditions of training, minimised and with velocities.
-
-    Raises KeyError where the domain does not say one of these, and what `Engine` raises.
-    """
+    """Yield OpenMM under the conditions of training, minimised and with velocities. Raises KeyError where the domain
+    does not say one of these, and what `Engine` raises."""
     from md_reference.forces.forcefield import resolve
     from md_reference.run.config import Conditions
     from md_reference.run.engine import Engine

@@ -34,10 +34,8 @@ def _known() -> dict[str, Option]:
 
 
 def as_flags(text: str) -> str:
-    """Return a message in which `overwrite=True` is --overwrite and `timestep_ps='1fs'` is --timestep 1fs.
-
-    What stands in a table of a `config` file alone is said so; any other word in backticks stays.
-    """
+    """Return a message in which `overwrite=True` is --overwrite and `timestep_ps='1fs'` is --timestep 1fs. What stands
+    in a table of a `config` file alone is said so; any other word in backticks stays."""
     return _NAMED.sub(_flag, text)
 
 

@@ -78,10 +78,8 @@ def _list_runs(campaign: Campaign) -> dict[str, Any]:
 
 
 def describe_campaign(folder: Path) -> dict[str, Any]:
-    """Return a JSON-able summary of a campaign's folder; `summary` is one line, `failed` the reasons.
-
-    Raises InputError when the folder holds no manifest.
-    """
+    """Return a JSON-able summary of a campaign's folder; `summary` is one line, `failed` the reasons. Raises InputError
+    when the folder holds no manifest."""
     manifest = read_manifest(campaign_folder(folder) or folder)
     runs, counts = list(manifest.runs.values()), manifest.counts()
     complete = [run for run in runs if run.status == COMPLETE]

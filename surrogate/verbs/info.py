@@ -73,10 +73,8 @@ def _coverage(path: Path, scene: str) -> dict[str, Any]:
 
 
 def describe_file(path: Path) -> dict[str, Any]:
-    """Return a JSON-able record of a file; `summary` is one line about it.
-
-    Raises InputError when there is no such file, TrajectoryError or WeightsError when it is damaged.
-    """
+    """Return a JSON-able record of a file; `summary` is one line about it. Raises InputError when there is no such
+    file, TrajectoryError or WeightsError when it is damaged."""
     from surrogate.data.frames import is_windows
 
     if not path.is_file():

@@ -69,10 +69,8 @@ class Validated:
 
 @dataclass(frozen=True, kw_only=True)
 class MDSettings:
-    """What the MD is and how it is run: fields of MDConfig, ForceFieldSpec and WaterBox.
-
-    What is left open (None) is resolved for the scene: by the protocol that is asked for, else by its default there.
-    """
+    """What the MD is and how it is run: fields of MDConfig, ForceFieldSpec and WaterBox. What is left open (None) is
+    resolved for the scene: by the protocol that is asked for, else by its default there."""
 
     protocol: str | None = option("Settings of a published protocol: md17, md22, mdgen, fast-folders.", None)
     force_field: str | None = from_field(ForceFieldSpec, "force_field", None, unset="auto")

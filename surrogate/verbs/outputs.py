@@ -51,9 +51,7 @@ def join_replicas(written: Sequence[Path], joined: Sequence[Path], *, overwrite:
 @contextmanager
 def summarised_outputs(paths: Sequence[Path], *, resumable: str = "") -> Iterator[None]:
     """Run a verb that writes trajectories; on Ctrl-C say what is kept, as the message of KeyboardInterrupt.
-
-    `resumable`: what the user does to go on, said when there is something to go on from.
-    """
+    `resumable`: what the user does to go on, said when there is something to go on from."""
     try:
         yield
     except KeyboardInterrupt:

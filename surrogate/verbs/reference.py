@@ -84,10 +84,8 @@ def reference(scene: str | Path | Scene, out: str | Path, options: ReferenceOpti
 def resolve_run(
     scene: Scene, options: PlanOptions | ReferenceOptions, length: dict[str, float], *, quiet: bool
 ) -> tuple[Scene, MDConfig, str]:
-    """Return the scene, solvated if asked, the settings of a run, and a line about what the protocol decided.
-
-    Of the options those count that are settings of a run (MDConfig, ForceFieldSpec) or make its box. Raises InputError.
-    """
+    """Return the scene, solvated if asked, the settings of a run, and a line about what the protocol decided. Of the
+    options those count that are settings of a run (MDConfig, ForceFieldSpec) or make its box. Raises InputError."""
     from md_reference.forces.forcefield import resolve
     from md_reference.forces.solvation import require_molecules, solvate_if_asked
     from md_reference.forces.spec import ForceFieldSpec, at_level

@@ -16,9 +16,7 @@ if TYPE_CHECKING:
 
 def systems(name: str | None = None) -> list[dict[str, Any]]:
     """Return what the library holds: one record per named scene, or the one asked for, with its protocols and atoms.
-
-    Raises UnknownNameError (with the nearest name).
-    """
+    Raises UnknownNameError (with the nearest name)."""
     if name is None:
         groups = named_scenes.groups()
         return [_describe(each) | {"group": group} for group in groups for each in groups[group]]
@@ -53,10 +51,8 @@ def _written(settings: dict[str, Any]) -> dict[str, Any]:
 
 
 def prepare_scene(scene: str | Path | Scene, options: Preparation, *, quiet: bool) -> Scene:
-    """Return a Scene for what a user may write, a path as such too; what had to be repaired is said on stderr.
-
-    Raises what `systems.library.named_scenes.prepare` raises.
-    """
+    """Return a Scene for what a user may write, a path as such too; what had to be repaired is said on stderr. Raises
+    what `systems.library.named_scenes.prepare` raises."""
     if not isinstance(scene, str | Path):
         return scene
     scene = str(scene)

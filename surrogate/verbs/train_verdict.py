@@ -72,10 +72,8 @@ class TrainingVerdict:
 
 
 def compare_training(path: Path) -> TrainingVerdict:
-    """Roll freshly trained weights from the structures they know, and say what they are good for.
-
-    Draws each chunk once, so that the share of frames that pass is the network's own. Raises WeightsError, InputError.
-    """
+    """Roll freshly trained weights from the structures they know, and say what they are good for. Draws each chunk
+    once, so that the share of frames that pass is the network's own. Raises WeightsError, InputError."""
     from surrogate.models.weights import load_weights
     from surrogate.training.loop import read_curves, series
 
