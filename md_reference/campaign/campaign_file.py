@@ -143,11 +143,7 @@ def read_campaign(path: str | Path, *, folder: str | Path | None = None) -> Camp
 
 
 # What a table says of its runs beside their settings.
-_AXES = {
-    "replicas": Annotated[int, range(1, _MOST_RUNS + 1)],
-    "temperatures": tuple[float | str, ...],
-    "protocol": str,
-}
+_AXES = {"replicas": Annotated[int, range(1, _MOST_RUNS + 1)], "temperatures": tuple[float | str, ...], "protocol": str}
 # How a scene is made: a campaign takes what the command line takes.
 _PREPARATION = options_of(Preparation) | options_of(WaterBox)
 

@@ -33,11 +33,7 @@ _SOLVENTS = {"alpb-water": "water"}
 
 
 def build_quantum_system(
-    scene: Scene,
-    *,
-    solvent: str = "vacuum",
-    hydrogen_mass_da: float | None = None,
-    constrain_hydrogens: bool = False,
+    scene: Scene, *, solvent: str = "vacuum", hydrogen_mass_da: float | None = None, constrain_hydrogens: bool = False
 ) -> Any:
     """Return an `openmm.System` whose one force is GFN2-xTB, without a cell, in vacuum or `alpb-water`.
 

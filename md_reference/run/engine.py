@@ -113,14 +113,7 @@ class Engine:
     Raises what `build_system` raises, and SimulationError when the platform cannot run the scene.
     """
 
-    def __init__(
-        self,
-        scene: Scene,
-        conditions: Conditions,
-        *,
-        threads: int | None = None,
-        system: Any = None,
-    ) -> None:
+    def __init__(self, scene: Scene, conditions: Conditions, *, threads: int | None = None, system: Any = None) -> None:
         import openmm
 
         self.ensemble = conditions.ensemble

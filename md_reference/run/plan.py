@@ -192,12 +192,7 @@ def _integrator(config: MDConfig) -> str:
 
 
 def plan_line(
-    scene: Scene,
-    config: MDConfig,
-    choice: PlatformChoice,
-    *,
-    step_s: float | None = None,
-    replicas: int = 0,
+    scene: Scene, config: MDConfig, choice: PlatformChoice, *, step_s: float | None = None, replicas: int = 0
 ) -> str:
     """Return the plan in one line: what runs on what, what is left out, and how long it takes where that is known.
 

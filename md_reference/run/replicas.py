@@ -33,13 +33,7 @@ from systems.errors import InputError, SimulationError, SurromdError
 from systems.interrupts import deferred_interrupt, end_with_parent
 from systems.scene import Scene
 from systems.trajectory.base import TrajectoryWriter
-from systems.trajectory.checkpoint import (
-    Checkpoint,
-    checkpoint_path,
-    locked_outputs,
-    supported_checkpoint,
-    writer_at,
-)
+from systems.trajectory.checkpoint import Checkpoint, checkpoint_path, locked_outputs, supported_checkpoint, writer_at
 
 # Frames are computed for about so long, then written and checkpointed.
 _BLOCK_S = 2.0

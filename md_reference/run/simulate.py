@@ -84,10 +84,7 @@ def simulate(
     out = Path(out)
     config = check_run(scene, config, out)
     chk = checkpoint_path(out)
-    with (
-        deferred_interrupt() as asked_to_stop,
-        locked_outputs([out], may_exist=resume or overwrite),
-    ):
+    with deferred_interrupt() as asked_to_stop, locked_outputs([out], may_exist=resume or overwrite):
         if resume and out.exists() and not chk.exists():
             already_complete(out, config)
             return out

@@ -18,15 +18,7 @@ from typer.core import TyperGroup
 
 import surrogate as sm
 from surrogate.bench.bench_options import CostErrorOptions, StressOptions
-from surrogate.cli.parameters import (
-    JsonOpt,
-    OutOpt,
-    SceneArg,
-    WeightsOpt,
-    literal,
-    usage_error,
-    with_options,
-)
+from surrogate.cli.parameters import JsonOpt, OutOpt, SceneArg, WeightsOpt, literal, usage_error, with_options
 from surrogate.cli.render import (
     as_flags,
     print_comparison,

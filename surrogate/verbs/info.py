@@ -103,11 +103,7 @@ def _trajectory(path: Path) -> dict[str, Any]:
         "file": str(path),
         "type": record.get("kind", "foreign") + " trajectory",
         "summary": f"{n_frames} frames of {n_atoms} atoms{span}{wall}{unfinished}",
-        "details": [
-            *summary_lines(record.get("summary") or {}),
-            *rollout_lines(record),
-            *intervention_lines(record),
-        ],
+        "details": [*summary_lines(record.get("summary") or {}), *rollout_lines(record), *intervention_lines(record)],
         "scene": None if scene is None else scene.name,
         "formula": None if scene is None else scene.formula,
         "topology_hash": None if scene is None else scene.topology_hash,
