@@ -7,15 +7,13 @@ message is one line.
 """
 
 from surrogate.verbs.campaign import campaign
-from surrogate.verbs.compare import compare
-from surrogate.verbs.demo import demo
+from surrogate.verbs.compare import compare, demo
 from surrogate.verbs.info import info
 from surrogate.verbs.reference import plan, reference
 from surrogate.verbs.rollout import rollout
 from surrogate.verbs.run.run_scenes import run
-from surrogate.verbs.scene_listing import systems
-from surrogate.verbs.train import explain_training, train
-from surrogate.verbs.windows import windows
+from surrogate.verbs.scenes import systems
+from surrogate.verbs.train import explain_training, train, windows
 
 __all__ = [
     "campaign",

@@ -35,7 +35,7 @@ def numbers(cell: str) -> list[float]:
 def draw_effective(table: dict[str, Any], out: Path) -> None:
     """Draw distance to the reference against effective samples a second, of the surrogates' settings and of MD, and the
     front: what nothing beats in both."""
-    from surrogate.bench.cost_error.effective_samples import pareto_front
+    from surrogate.bench.accuracy import pareto_front
 
     rows = [dict(zip(table["columns"], row, strict=True)) for row in table["rows"]]
     points = [(numbers(row["effective samples/s"])[0], numbers(row["distance"])[0]) for row in rows]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 import tomllib
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from dataclasses import MISSING, Field, dataclass, field, fields, replace
 from glob import glob
 from hashlib import sha256
@@ -18,7 +18,7 @@ from systems.errors import InputError, SurromdError, nearest
 from systems.files.outside import content
 from systems.files.schema import built, fitted, parsed
 from systems.library.named_scenes import find_protocol
-from systems.options import Option, Preparation, options_of
+from systems.options import Preparation, options_of
 from systems.units import parse_wall_s, parser_of, quantity
 
 T = TypeVar("T")
@@ -58,9 +58,8 @@ class Run:
 class ClusterSpec:
     """What is asked of a batch system, through dask-jobqueue: `jobs` jobs at most, each with `cores` runs at a time.
 
-    `interface`: the network interface on which scheduler and workers talk. `dashboard`: where Dask's status page is to
-    be shown (`127.0.0.1:8787`); whoever can reach it sees it. Without it there is none. Of the kinds, which are those
-    that dask-jobqueue knows, `local` starts the same jobs as processes here, to try a file out.
+    `interface`: the network interface on which scheduler and workers talk. Of the kinds, which are those that
+    dask-jobqueue knows, `local` starts the same jobs as processes here, to try a file out.
     """
 
     kind: Literal["slurm", "pbs", "sge", "lsf", "htcondor", "moab", "oar", "local"]
@@ -71,7 +70,6 @@ class ClusterSpec:
     queue: str = ""
     account: str = ""
     interface: str = ""
-    dashboard: str = ""
     python: str = ""
     directives: tuple[str, ...] = ()
     prologue: tuple[str, ...] = ()
@@ -139,18 +137,15 @@ def read_campaign(path: str | Path, *, folder: str | Path | None = None) -> Camp
         raise InputError(f"{path} cannot be read as TOML: {error}.") from error
     try:
         return _campaign(table, path, text, None if folder is None else Path(folder))
-    except ValueError as error:
-        raise InputError(f"{path}: {error}.") from error
-    except InputError as error:
-        raise InputError(str(error) if str(path) in str(error) else f"{path}: {error}") from error
+    except (ValueError, InputError) as error:
+        said = f"{error}." if isinstance(error, ValueError) else str(error)
+        raise InputError(said if str(path) in said else f"{path}: {said}") from error
 
 
 # What a table says of its runs beside their settings.
-_AXES = {
-    "replicas": Annotated[int, range(1, _MOST_RUNS + 1)],
-    "temperatures": tuple[float | str, ...],
-    "protocol": str,
-}
+_AXES = {"replicas": Annotated[int, range(1, _MOST_RUNS + 1)], "temperatures": tuple[float | str, ...], "protocol": str}
+# How a scene is made: a campaign takes what the command line takes.
+_PREPARATION = options_of(Preparation) | options_of(WaterBox)
 
 
 def _campaign(table: dict[str, Any], path: Path, text: str, folder: Path | None) -> Campaign:
@@ -189,14 +184,7 @@ def _campaign(table: dict[str, Any], path: Path, text: str, folder: Path | None)
 def _read(kind: type[T], table: dict[str, Any], where: str) -> tuple[T, Settings]:
     """Return what a table says of itself and of its runs: axes, preparation and settings, unknown keys refused."""
     own = {f.name for f in fields(cast(Any, kind))}
-    settings = read_settings(
-        {key: value for key, value in table.items() if key not in own},
-        axes=_AXES,
-        # A campaign takes what the command line takes.
-        preparation=options_of(Preparation) | options_of(WaterBox),
-        others=own,
-        where=where,
-    )
+    settings = read_settings({key: value for key, value in table.items() if key not in own}, others=own, where=where)
     return built(kind, {key: value for key, value in table.items() if key in own}, where), settings
 
 
@@ -209,33 +197,22 @@ def key_of(name: str) -> str:
     return next((name.removesuffix(ending) for ending in _ENDINGS if name.endswith(ending)), name)
 
 
-def read_settings(
-    table: dict[str, Any],
-    *,
-    axes: Mapping[str, Any],
-    preparation: Mapping[str, Option],
-    others: Iterable[str],
-    where: str,
-) -> Settings:
-    """Return a table's settings, in our units. `axes`: the annotations of what else it may say of runs; `preparation`:
-    the options of how a scene is made.
-
-    Raises InputError for a key that is neither (with the nearest that is; `others` are keys the caller has read),
-    ValueError for values of the wrong kind.
-    """
+def read_settings(table: dict[str, Any], *, others: Iterable[str] = (), where: str = "") -> Settings:
+    """Return a table's settings, in our units. Raises InputError for a key that is unknown (with the nearest that is
+    known; `others` are keys the caller has read), ValueError for values of the wrong kind."""
     hints = get_type_hints(MDConfig) | get_type_hints(ForceFieldSpec)
     by_key = {key_of(name): name for name in _known_fields()}
     found = Settings({}, {}, {})
     for key, value in table.items():
-        if key in axes:
-            found.axes[key] = fitted(value, axes[key], f"{where}{key}")
-        elif key in preparation:
-            found.preparation[key] = preparation[key].value(value, f"{where}{key}")
+        if key in _AXES:
+            found.axes[key] = fitted(value, _AXES[key], f"{where}{key}")
+        elif key in _PREPARATION:
+            found.preparation[key] = _PREPARATION[key].value(value, f"{where}{key}")
         elif key in by_key:
             name = by_key[key]
             found.values[name] = _value(name, hints[name], value, f"{where}{key}")
         else:
-            meant = nearest(key, [*by_key, *preparation, *axes, *others])
+            meant = nearest(key, [*by_key, *_PREPARATION, *_AXES, *others])
             raise InputError(f"{where}unknown key {key!r}.{meant}")
     return found
 
@@ -260,15 +237,14 @@ def _scene_tables(head: _Head, base: Path) -> list[dict[str, Any]]:
     for number, listed in enumerate(head.scenes):
         entry = {"scene": listed} if isinstance(listed, str) else listed
         text = fitted(entry.get("scene"), str, f"scenes[{number}].scene").strip()
+        paths = [text]
         if "*" in text and not _kind(text):
             paths = sorted(glob(text, root_dir=base, recursive=True))
             if not paths:
                 raise InputError(f"scenes[{number}]: no file matches {text}.")
             if "name" in entry:
                 raise InputError(f"scenes[{number}]: one name cannot serve the {len(paths)} files of {text}.")
-            found += [{**entry, "scene": path} for path in paths]
-        else:
-            found.append({**entry, "scene": text})
+        found += [{**entry, "scene": path} for path in paths]
     return found
 
 
@@ -280,12 +256,14 @@ def _kind(text: str) -> str:
 
 def _scene_spec(head: _SceneHead, preparation: dict[str, Any], base: Path, where: str) -> SceneSpec:
     source, digest = head.scene, ""
-    if not _kind(source) and (Path(source).suffix.lower() in SCENE_FILES or "/" in source):
+    if _kind(source):
+        pass
+    elif Path(source).suffix.lower() in SCENE_FILES or "/" in source:
         path = (base / source).resolve()
         if not path.is_file():
             raise InputError(f"{where}no such file: {path}.")
         source, digest = str(path), file_sha256(path)
-    elif not _kind(source):
+    else:
         from systems.library import named_scenes
 
         named_scenes.entry(source)  # an unknown name is refused now, with the nearest
@@ -298,22 +276,16 @@ def name_of(source: str) -> str:
     """A name for files: a file's stem, a sequence, a SMILES with what files cannot have replaced, and then a hash."""
     kind = _kind(source)
     text = source.partition(":")[2] if kind else Path(source).name.removesuffix(".gz")
-    stem = text if kind or "." not in text else text.rsplit(".", 1)[0]
-    # SMILES differ in case and in signs that file names cannot have.
-    return _hashed(stem, source, kind) if kind.lower() == "smiles" else file_name_of(stem, source, kind)
+    return file_name_of(text if kind or "." not in text else text.rsplit(".", 1)[0], source, kind)
 
 
 def file_name_of(name: str, source: str = "", kind: str = "") -> str:
     """A name that files can have, of one that need not be: where they differ with a hash of `source`, else of it."""
-    return name if _plain(name) == name else _hashed(name, source or name, kind)
-
-
-def _plain(name: str) -> str:
-    return re.sub(r"[^A-Za-z0-9._+-]+", "_", name).strip("._-+")[:_LONGEST_NAME]
-
-
-def _hashed(name: str, source: str, kind: str) -> str:
-    return f"{_plain(name) or kind or 'scene'}-{sha256(source.encode()).hexdigest()[:6]}"
+    plain = re.sub(r"[^A-Za-z0-9._+-]+", "_", name).strip("._-+")[:_LONGEST_NAME]
+    # SMILES differ in case and in signs that file names cannot have.
+    if plain == name and kind.lower() != "smiles":
+        return name
+    return f"{plain or kind or 'scene'}-{sha256((source or name).encode()).hexdigest()[:6]}"
 
 
 def _runs_of(spec: SceneSpec, shared: Settings, own: Settings, head: _Head) -> list[Run]:
@@ -351,13 +323,15 @@ def _runs_of(spec: SceneSpec, shared: Settings, own: Settings, head: _Head) -> l
 def _by_protocol(shared: Settings, own: Settings) -> tuple[Settings, str | None]:
     """Return the protocol that a scene's runs go by, and the campaign's settings without what it outweighs: a protocol
     of the scene's own outweighs what the campaign says, that of the campaign does not."""
-    if "protocol" not in own.axes:
+    name = own.axes.get("protocol")
+    if name is None:
         return shared, shared.axes.get("protocol")
-    name = own.axes["protocol"]
     decided = find_protocol(name).settings
     values = {key: value for key, value in shared.values.items() if key not in decided}
-    left_out = ("protocol", "temperatures") if "temperature_k" in decided else ("protocol",)
-    return replace(shared, values=values, axes={k: v for k, v in shared.axes.items() if k not in left_out}), name
+    axes = {key: value for key, value in shared.axes.items() if key != "protocol"}
+    if "temperature_k" in decided:
+        axes.pop("temperatures", None)
+    return replace(shared, values=values, axes=axes), name
 
 
 def first_seed(seed: int, scene: str, temperature_k: float) -> int:

@@ -18,8 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from md_reference.campaign.campaign_file import JOB_LOGS, ClusterSpec
-from md_reference.forces.small_molecules.programs import scratch_folder
-from md_reference.run.machine import available_cores
+from md_reference.forces.programs import scratch_folder
 from systems.errors import InputError, SimulationError, StorageError, SurromdError
 from systems.interrupts import deferred_interrupt, stop_if_asked, stop_when
 
@@ -47,23 +46,23 @@ def open_client(
     `scheduler` (tls://host:port, or tcp:// if its owner wants no lock) goes before `cluster`, and both before local
     workers, one thread each (`workers`, as many as there are cores by default). Who can reach a scheduler runs code as
     its user, so what is started here talks by TLS with a certificate of its own, which nobody else has, on one network
-    interface, local workers on the loopback, and shows no status page unless `[cluster] dashboard` asks for one.
-    Raises InputError when no scheduler answers or dask-jobqueue is not installed.
+    interface, local workers on the loopback, and shows no status page. Raises InputError when no scheduler answers or
+    dask-jobqueue is not installed.
     """
     if workers is not None and scheduler is not None:
         raise InputError("`workers` starts workers here, `scheduler` uses those that are there; give one of them.")
     import dask
     from distributed import Client
 
-    settings = {"distributed.scheduler.allowed-failures": retries, "distributed.worker.http.routes": []}
-    if cluster is None or not cluster.dashboard:
-        settings["distributed.scheduler.http.routes"] = []
+    from md_reference.run.machine import available_cores  # slow to import
+
+    no_pages: dict[str, list[str]] = {f"distributed.{part}.http.routes": [] for part in ("worker", "scheduler")}
     with ExitStack() as stack:
         # What matters of Dask's messages stands in the campaign's own summary.
         for logger in map(logging.getLogger, ("distributed", "tornado", "asyncio", "dask_jobqueue")):
             stack.callback(logger.setLevel, logger.level)
             logger.setLevel(logging.CRITICAL)
-        stack.enter_context(dask.config.set(settings))
+        stack.enter_context(dask.config.set({"distributed.scheduler.allowed-failures": retries, **no_pages}))
         if scheduler is not None:
             try:
                 client = stack.enter_context(Client(scheduler, timeout=_ANSWER_S, set_as_default=False))
@@ -133,7 +132,7 @@ def job_cluster(spec: ClusterSpec, folder: Path) -> Any:
         python, prologue = " ".join(["env", *one_thread, spec.python or sys.executable]), []
     logs = (folder / JOB_LOGS).resolve()
     logs.mkdir(parents=True, exist_ok=True)
-    scheduler: dict[str, Any] = {"dashboard": bool(spec.dashboard), "dashboard_address": spec.dashboard or _NO_PAGE}
+    scheduler: dict[str, Any] = {"dashboard": False, "dashboard_address": _NO_PAGE}
     if not spec.interface:
         scheduler["host"] = "127.0.0.1" if spec.kind == "local" else get_ip()
     given = {key: getattr(spec, key) for key in ("walltime", "queue", "account", "interface")} | {"python": python}
@@ -184,7 +183,7 @@ def poll(token: str) -> dict[str, Any]:
     """Return this worker's process and the frames done by each of its active runs; the command is heard of."""
     session = session_of(token)
     session.heard_at = time.monotonic()
-    return {"pid": os.getpid(), "host": socket.gethostname(), "frames": dict(session.frames)}
+    return {"pid": os.getpid(), "frames": dict(session.frames)}
 
 
 def stop(token: str) -> None:

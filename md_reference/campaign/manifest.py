@@ -148,18 +148,17 @@ def campaign_trajectories(path: Path, *, verify: bool = False) -> tuple[list[Pat
     complete = [run for run in entries if run.status == COMPLETE]
     if not complete:
         raise InputError(f"{path}: none of the {len(entries)} runs of this campaign here is complete.")
-    for run in complete if verify else ():
-        for name, expected in run.sha256.items():
-            file = folder / name
-            if not file.is_file():
-                raise TrajectoryError(
-                    f"{file} is gone, though {MANIFEST_NAME} lists it; run the campaign again to remake it."
-                )
-            if file_sha256(file) != expected:
-                raise TrajectoryError(
-                    f"{file} is not the file that the campaign wrote (its sha256 differs from {MANIFEST_NAME}); "
-                    "delete it and run the campaign again to remake it."
-                )
+    for name, expected in [item for run in complete for item in run.sha256.items()] if verify else ():
+        file = folder / name
+        if not file.is_file():
+            raise TrajectoryError(
+                f"{file} is gone, though {MANIFEST_NAME} lists it; run the campaign again to remake it."
+            )
+        if file_sha256(file) != expected:
+            raise TrajectoryError(
+                f"{file} is not the file that the campaign wrote (its sha256 differs from {MANIFEST_NAME}); delete it "
+                "and run the campaign again to remake it."
+            )
     return [folder / run.file for run in complete], len(entries) - len(complete)
 
 
@@ -174,16 +173,17 @@ def frames_sha256(path: Path) -> str:
     from systems.trajectory.codec import open_trajectory
 
     digest = hashlib.sha256()
+
+    def add(values: Any, kind: str) -> None:
+        digest.update(b"" if values is None else np.asarray(values, dtype=kind).tobytes())
+
     with open_trajectory(path) as reader:
-        digest.update(np.asarray(reader.time_ps, dtype="<f8").tobytes())
+        add(reader.time_ps, "<f8")
         for name in sorted(reader.scalars):
             digest.update(name.encode())
-            digest.update(np.asarray(reader.scalars[name], dtype="<f8").tobytes())
-        for start in range(0, reader.n_frames, 4096):
-            stop = start + 4096
-            digest.update(np.asarray(reader.read(start, stop), dtype="<f4").tobytes())
-            for extra in (reader.read_velocities(start, stop), reader.read_forces(start, stop)):
-                digest.update(b"" if extra is None else np.asarray(extra, dtype="<f4").tobytes())
-            cells = reader.read_cells(start, stop)
-            digest.update(b"" if cells is None else np.asarray(cells, dtype="<f8").tobytes())
+            add(reader.scalars[name], "<f8")
+        for part in ((start, start + 4096) for start in range(0, reader.n_frames, 4096)):
+            for read in (reader.read, reader.read_velocities, reader.read_forces):
+                add(read(*part), "<f4")
+            add(reader.read_cells(*part), "<f8")
     return digest.hexdigest()

@@ -16,7 +16,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 from md_reference.campaign.campaign_file import JOB_LOGS, Campaign, Run, SceneSpec, default_of, first_seed, key_of
 from md_reference.campaign.cluster import poll, result_of, stop
@@ -32,7 +32,7 @@ from md_reference.campaign.manifest import (
     read_manifest,
     write_manifest,
 )
-from md_reference.run.config import flat_settings
+from md_reference.run.config import settings_of
 from systems.errors import InputError, TrajectoryError
 from systems.files.whole_file import OutputLock
 from systems.interrupts import deferred_interrupt
@@ -59,28 +59,22 @@ def new_manifest(campaign: Campaign) -> Manifest:
     """Return the manifest of a campaign that has not begun."""
     from importlib.metadata import version
 
-    scenes = [SceneEntry(s.name, s.source, s.source_sha256, s.preparation) for s in campaign.scenes]
-    runs = [
-        RunEntry(
-            name=run.name,
-            scene=run.scene,
-            temperature_k=run.config.temperature_k,
-            replica=run.replica,
-            seed=run.config.seed,
-            file=run.file,
-            settings=flat_settings(run.config),
-            n_frames_wanted=run.config.n_frames,
-        )
-        for run in campaign.runs
-    ]
+    programs = {name: version(name) for name in ("openmm", "distributed")}
     return Manifest(
         name=campaign.name,
         seed=campaign.seed,
-        scenes={scene.name: scene for scene in scenes},
-        runs={run.name: run for run in runs},
-        programs={"python": platform.python_version()} | {name: version(name) for name in ("openmm", "distributed")},
+        scenes={s.name: SceneEntry(s.name, s.source, s.source_sha256, s.preparation) for s in campaign.scenes},
+        runs={run.name: _new_entry(run) for run in campaign.runs},
+        programs={"python": platform.python_version(), **programs},
         started=datetime.now(UTC).isoformat(timespec="seconds"),
     )
+
+
+def _new_entry(run: Run) -> RunEntry:
+    settings = settings_of(run.config)
+    seed = settings.pop("seed")  # which belongs to the run's place among others
+    name, kelvin = run.name, run.config.temperature_k
+    return RunEntry(name, run.scene, kelvin, run.replica, seed, run.file, settings, run.config.n_frames)
 
 
 def check_same_campaign(old: Manifest, new: Manifest, folder: Path) -> Manifest:
@@ -113,23 +107,19 @@ def check_same_campaign(old: Manifest, new: Manifest, folder: Path) -> Manifest:
             is_replica = any((r.scene, r.temperature_k) == (run.scene, run.temperature_k) for r in new.runs.values())
             axis = "replicas" if is_replica else "temperatures"
             same(f"{axis} of scene {run.scene}", f"with {name}", "without it")
-        settings = runs[name].settings
-        if run.file != runs[name].file:
-            same("format", Path(run.file).suffix[1:], Path(runs[name].file).suffix[1:])
-            same(f"file of {name}", run.file, runs[name].file)
-        for key in {**run.settings, **settings}:
-            was, now = (given.get(key, default_of(key)) for given in (run.settings, settings))
+        same("format", Path(run.file).suffix[1:], Path(runs[name].file).suffix[1:])
+        same(f"file of {name}", run.file, runs[name].file)
+        for key in {**run.settings, **runs[name].settings}:
+            was, now = (given.get(key, default_of(key)) for given in (run.settings, runs[name].settings))
             same(f"{key_of(key)} of scene {run.scene} ({key})", was, now)
-        runs[name] = _kept(run, folder / run.file)
+        file = folder / run.file
+        if run.status != COMPLETE or not file.is_file() or file.stat().st_size != run.size_bytes:
+            # What is gone is made anew, and need not come out the same on another machine; what is there must be what
+            # it was.
+            kept = run.frames_sha256 if file.is_file() else ""
+            run = replace(run, status=WAITING, reason="", n_frames=0, frames_sha256=kept)
+        runs[name] = run
     return replace(new, scenes=scenes, runs=runs, started=old.started)
-
-
-def _kept(run: RunEntry, file: Path) -> RunEntry:
-    is_there = file.is_file()
-    if run.status == COMPLETE and is_there and file.stat().st_size == run.size_bytes:
-        return run
-    # What is gone is made anew, and need not come out the same on another machine; what is there must be what it was.
-    return replace(run, status=WAITING, reason="", n_frames=0, frames_sha256=run.frames_sha256 if is_there else "")
 
 
 def open_campaign(campaign: Campaign) -> Manifest:
@@ -222,7 +212,7 @@ class _Job:
         self._collect()
         for name in {name for runs in self._active.values() for name in runs}:
             if self.manifest.runs[name].status == WAITING:
-                self._note("runs", name, status=RUNNING)
+                self._note(self.manifest.runs, name, status=RUNNING)
         if not self._is_written and time.monotonic() > self._write_at:
             began = time.monotonic()
             write_manifest(self._campaign.folder, self.manifest)
@@ -243,9 +233,9 @@ class _Job:
         while self._out and time.monotonic() < deadline:
             time.sleep(_TICK_S)
             self._collect(again=False)
-        for name, entry in self.manifest.runs.items():
+        for name, entry in list(self.manifest.runs.items()):
             if entry.status == RUNNING:
-                self._note("runs", name, status=WAITING)
+                self._note(self.manifest.runs, name, status=WAITING)
 
     def progress(self) -> CampaignProgress:
         """Return how far the campaign is; an active run counts the frames that its worker last reported."""
@@ -282,17 +272,15 @@ class _Job:
         key = f"surromd-{self._token}-{task.name}-{next(self._numbers)}"
         own: tuple[Any, ...]
         if isinstance(task, SceneSpec):
-            seed = first_seed(self._campaign.seed, task.name, 0.0)
-            runs = self._runs[task.name]
-            replicas = 1 + max(run.replica for run in runs)
-            work, own = "prepare_scene", (task, runs[0].config, seed, replicas)
+            runs, seed = self._runs[task.name], first_seed(self._campaign.seed, task.name, 0.0)
+            own = ("prepare_scene", task, runs[0].config, seed, 1 + max(run.replica for run in runs))
             priority = 1 << 62
         else:
             expected = self.manifest.runs[task.name].frames_sha256
-            work, own = "simulate_run", (task, self._campaign.checkpoint_every_s, expected)
-            atoms = self.manifest.scenes[task.scene].n_atoms or 1
-            priority = atoms * task.config.n_frames * task.config.steps_per_frame
-        future = self._client.submit(_work, work, self._token, self._folder, *own, key=key, priority=priority)
+            own = ("simulate_run", task, self._campaign.checkpoint_every_s, expected)
+            n_steps = task.config.n_frames * task.config.steps_per_frame
+            priority = (self.manifest.scenes[task.scene].n_atoms or 1) * n_steps
+        future = self._client.submit(_work, self._token, self._folder, *own, key=key, priority=priority)
         self._out[key] = (task, attempt, future)
         self._ended.add(future)
 
@@ -320,26 +308,27 @@ class _Job:
     def _done(self, task: SceneSpec | Run, attempt: int, **entries: Any) -> None:
         if isinstance(task, Run):
             attempts = self.manifest.runs[task.name].attempts + attempt
-            self._note("runs", task.name, attempts=attempts, **entries)
+            self._note(self.manifest.runs, task.name, attempts=attempts, **entries)
             return
-        self._note("scenes", task.name, **entries)
+        self._note(self.manifest.scenes, task.name, **entries)
         for run in self._runs[task.name]:
             if entries["status"] == COMPLETE:
                 self._submit(run)
             else:
-                self._note("runs", run.name, status=FAILED, reason=f"scene {task.name}: {entries['reason']}")
+                self._note(
+                    self.manifest.runs, run.name, status=FAILED, reason=f"scene {task.name}: {entries['reason']}"
+                )
 
-    def _note(self, table: Literal["scenes", "runs"], name: str, **entries: Any) -> None:
-        old: dict[str, Any] = getattr(self.manifest, table)
-        changed: dict[str, Any] = {table: {**old, name: replace(old[name], **entries)}}
-        self.manifest, self._is_written = replace(self.manifest, **changed), False
+    def _note(self, table: dict[str, Any], name: str, **entries: Any) -> None:
+        table[name] = replace(table[name], **entries)
+        self._is_written = False
 
 
-def _work(name: str, *given: Any) -> dict[str, Any]:
+def _work(token: str, folder: Path, name: str, *given: Any) -> dict[str, Any]:
     """Do a task of `md_reference.campaign.worker`, which imports OpenMM: only workers do."""
     from md_reference.campaign import worker
 
-    result: dict[str, Any] = getattr(worker, name)(*given)
+    result: dict[str, Any] = getattr(worker, name)(token, folder, *given)
     return result
 
 

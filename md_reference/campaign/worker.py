@@ -23,7 +23,7 @@ from md_reference.forces.forcefield import build_system, resolve
 from md_reference.forces.solvation import require_molecules, solvate
 from md_reference.forces.spec import ForceFieldSpec, WaterBox
 from md_reference.run.config import MDConfig
-from md_reference.run.platforms import PlatformChoice, measured_platform
+from md_reference.run.machine import PlatformChoice, measured_platform
 from md_reference.run.simulate import simulate
 from md_reference.run.starts import many_starts
 from systems.chemistry.graph import molecule_key
@@ -83,17 +83,14 @@ def scene_path(folder: Path, name: str) -> Path:
 def prepare_scene(
     token: str, folder: Path, spec: SceneSpec, config: MDConfig, seed: int, replicas: int = 1
 ) -> dict[str, Any]:
-    """Prepare a scene, or take the one that lies in `scenes/NAME.json`, and return its summary.
+    """Prepare a scene, or take the one that lies in `scenes/NAME.json`, and return its summary. `config`: of any of its
+    runs, which share all but temperature and seed; `seed`: of the water around it; `replicas`: how many begin apart."""
+    path = scene_path(folder, spec.name)
 
-    `config`: of any of its runs, which share all but temperature and seed; `seed`: of the water around it;
-    `replicas`: how many begin apart.
-    """
+    def prepared() -> PreparedScene:
+        return load_prepared(path) if path.is_file() else _prepare(path, spec, config, seed, replicas)
 
-    def work() -> dict[str, Any]:
-        path = scene_path(folder, spec.name)
-        return (load_prepared(path) if path.is_file() else _prepare(path, spec, config, seed, replicas)).summary()
-
-    return guarded(token, folder / MANIFEST_NAME, work)
+    return guarded(token, folder / MANIFEST_NAME, lambda: prepared().summary())
 
 
 def _prepare(path: Path, spec: SceneSpec, config: MDConfig, seed: int, replicas: int) -> PreparedScene:
@@ -139,26 +136,15 @@ def load_prepared(path: Path) -> PreparedScene:
 
 
 def simulate_run(token: str, folder: Path, run: Run, checkpoint_every_s: float, expected: str) -> dict[str, Any]:
-    """Simulate a run, or go on with it, and return what the manifest says of it when it is complete.
-
-    `expected`: the hash of its frames, where the manifest already has one.
-    """
-    frames = session_of(token).frames
-
-    def work() -> dict[str, Any]:
-        # Read when OpenMM creates its first Context: one thread per replica.
-        os.environ["OPENMM_CPU_THREADS"] = "1"
-        frames[run.name] = 0
-        try:
-            return _simulate(token, folder, run, checkpoint_every_s, expected)
-        finally:
-            frames.pop(run.name, None)
-
-    return guarded(token, folder / MANIFEST_NAME, work)
+    """Simulate a run, or go on with it, and return what the manifest says of it when it is complete. `expected`: the
+    hash of its frames, where the manifest already has one."""
+    return guarded(token, folder / MANIFEST_NAME, lambda: _simulate(token, folder, run, checkpoint_every_s, expected))
 
 
 def _simulate(token: str, folder: Path, run: Run, checkpoint_every_s: float, expected: str) -> dict[str, Any]:
     session = session_of(token)
+    # Read when OpenMM creates its first Context: one thread per replica.
+    os.environ["OPENMM_CPU_THREADS"] = "1"
 
     def report(done: int, total: int, note: str | None = None) -> None:
         if note is None:
@@ -169,15 +155,13 @@ def _simulate(token: str, folder: Path, run: Run, checkpoint_every_s: float, exp
     out.parent.mkdir(parents=True, exist_ok=True)
     # A worker that this one stands in for, cut off and not yet stopped, may still have the file.
     OutputLock(out, patience_s=2 * LEASE_S, stopped=session.should_stop).close()
-    simulate(
-        prepared.start_of(run.replica, run.config),
-        replace(run.config, force=prepared.force),
-        out,
-        resume=True,
-        progress=report,
-        checkpoint_every_s=checkpoint_every_s,
-        choice=prepared.platform,
-    )
+    start, config = prepared.start_of(run.replica, run.config), replace(run.config, force=prepared.force)
+    how: dict[str, Any] = {"checkpoint_every_s": checkpoint_every_s, "choice": prepared.platform}
+    session.frames[run.name] = 0
+    try:
+        simulate(start, config, out, resume=True, progress=report, **how)
+    finally:
+        session.frames.pop(run.name, None)
     with open_trajectory(out) as reader:
         record, n_frames = dict(reader.record), reader.n_frames
     digest = frames_sha256(out)

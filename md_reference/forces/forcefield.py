@@ -2,70 +2,47 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
-from md_reference.forces import implicit_solvent
+from md_reference.forces.gaff import load_openmm, parameters
 from md_reference.forces.mixture import is_water, merge, molecules_of
 from md_reference.forces.nonstandard import build_chain, find_chain
 from md_reference.forces.quantum import build_quantum_system
-from md_reference.forces.small_molecules.gaff import parameters
-from md_reference.forces.small_molecules.prmtop import load_openmm
 from md_reference.forces.spec import MODEL, PROTEIN_FORCE_FIELDS, QUANTUM, ForceFieldSpec, cutoff_nm
-from md_reference.forces.templates import build_templated, uncovered_residue
-from systems.errors import InputError, PreparationError
+from md_reference.forces.templates import build_templated, gbn2, native_obc2, uncovered_residue
+from systems.errors import PreparationError
 from systems.library.named_scenes import check_law
 from systems.scene import IntArray, Scene, once_per_scene, part_of
+
+# Energies of the model systems, in kJ/mol; lengths in nm.
+_LAWS = {
+    "harmonic": "0.5*(kx*x^2+ky*y^2+kz*z^2)",
+    "double-well": "barrier_kj_mol*((x/minimum_nm)^2-1)^2 + tilt_kj_mol_nm*x + 0.5*transverse_kj_mol_nm2*(y^2+z^2)",
+}
 
 
 def build_model_system(scene: Scene) -> Any:
     """Return the `openmm.System` of a scene with `interactions`: particles with the scene's masses, one custom force.
+    No constraints, no cell, no centre-of-mass removal. Raises InputError for a law that is unknown or incomplete."""
+    from openmm import CustomExternalForce, System
 
-    No constraints, no cell, no centre-of-mass removal. Raises InputError for a law that is unknown or incomplete.
-    """
-    from openmm import System
-
-    law = scene.interactions
-    if law is None:
-        raise InputError(f"scene {scene.name!r} is no model system: it has no `interactions`.")
+    law = dict(scene.interactions or {})
     check_law(law)
-    system = System()
-    for mass_da in scene.masses_da.tolist():
+    kind = law.pop("kind")
+    if kind == "harmonic":
+        law = dict(zip(("kx", "ky", "kz"), law["force_constants_kj_mol_nm2"], strict=True))
+    system, force = System(), CustomExternalForce(_LAWS[kind])
+    force.setName(f"{kind} law")
+    for name, value in law.items():
+        force.addGlobalParameter(name, value)
+    for k, mass_da in enumerate(scene.masses_da.tolist()):
         system.addParticle(mass_da)
-    force = _FORCES[law["kind"]](law, scene)
-    force.setName(f"{law['kind']} law")
+        force.addParticle(k, [])
     system.addForce(force)
     return system
-
-
-def _harmonic(law: dict[str, Any], scene: Scene) -> Any:
-    names = dict(zip(("kx", "ky", "kz"), law["force_constants_kj_mol_nm2"], strict=True))
-    return _external_force("0.5*(kx*x^2+ky*y^2+kz*z^2)", names, scene.n_atoms)
-
-
-def _double_well(law: dict[str, Any], scene: Scene) -> Any:
-    energy = "barrier_kj_mol*((x/minimum_nm)^2-1)^2 + tilt_kj_mol_nm*x + 0.5*transverse_kj_mol_nm2*(y^2+z^2)"
-    return _external_force(energy, {key: value for key, value in law.items() if key != "kind"}, scene.n_atoms)
-
-
-def _external_force(energy: str, constants: dict[str, float], n_particles: int) -> Any:
-    from openmm import CustomExternalForce
-
-    force = CustomExternalForce(energy)
-    for name, value in constants.items():
-        force.addGlobalParameter(name, value)
-    for k in range(n_particles):
-        force.addParticle(k, [])
-    return force
-
-
-_FORCES: dict[str, Callable[[dict[str, Any], Scene], Any]] = {
-    "harmonic": _harmonic,
-    "double-well": _double_well,
-}
 
 
 # ---- the force field of a scene -------------------------------------------------------------------------------------
@@ -73,7 +50,7 @@ _FORCES: dict[str, Callable[[dict[str, Any], Scene], Any]] = {
 
 @once_per_scene
 def resolve(scene: Scene, spec: ForceFieldSpec) -> ForceFieldSpec:
-    """Return the spec with 'auto' settled for this scene; this is what a record states.
+    """Return the spec with 'auto' resolved for this scene; this is what a record states.
 
     Force field: ff14SB where it covers every residue, gaff2 where it covers no molecule but water and ions,
     ff14SB+gaff2 where it covers some. Solvent: TIP3P where the scene has a cell, vacuum for gaff2 alone, else obc2.
@@ -112,29 +89,25 @@ def _choose(scene: Scene) -> str:
     return "gaff2"
 
 
-def build_system(scene: Scene, spec: ForceFieldSpec, *, native_gb: bool = True) -> Any:
+def build_system(scene: Scene, spec: ForceFieldSpec) -> Any:
     """Return the `openmm.System` of a scene: without a cell no cut-off, in one PME; no centre-of-mass removal.
 
-    Particles are the scene's atoms in its order; virtual sites (OPC) come after them. With `native_gb` the OBC2 term is
-    OpenMM's GBSAOBCForce; without it, the CustomGBForce of implicit/obc2.xml, which gives the same energies (a test
-    holds them together) and is several times slower on small scenes. Raises PreparationError when the force field has
-    no parameters for a residue or a molecule, or does not suit the scene's cell.
+    Particles are the scene's atoms in its order; virtual sites (OPC) come after them. The OBC2 term is OpenMM's
+    GBSAOBCForce, not the CustomGBForce of implicit/obc2.xml, which gives the same energies (a test holds them together)
+    and is several times slower on small scenes. Raises PreparationError when the force field has no parameters for a
+    residue or a molecule, or does not suit the scene's cell.
     """
     spec = resolve(scene, spec)
     if spec.force_field == MODEL:
         return build_model_system(scene)
     _check_cell(scene, spec)
     if spec.force_field == QUANTUM:
-        return build_quantum_system(
-            scene,
-            solvent=spec.solvent,
-            hydrogen_mass_da=spec.hydrogen_mass_da,
-            constrain_hydrogens=spec.constrain_hydrogens,
-        )
+        heavy, rigid = spec.hydrogen_mass_da, spec.constrain_hydrogens
+        return build_quantum_system(scene, solvent=spec.solvent, hydrogen_mass_da=heavy, constrain_hydrogens=rigid)
     if spec.force_field in PROTEIN_FORCE_FIELDS:
-        system = build_templated(scene, spec, native_gb=native_gb)
+        system = build_templated(scene, spec)
     else:
-        system = _build_mixed(scene, spec, native_gb)
+        system = _build_mixed(scene, spec)
     if scene.cell_nm is not None:
         system.setDefaultPeriodicBoxVectors(*(row.tolist() for row in scene.cell_nm))
     return system
@@ -161,8 +134,10 @@ def _check_cell(scene: Scene, spec: ForceFieldSpec) -> None:
             )
 
 
-def _build_mixed(scene: Scene, spec: ForceFieldSpec, native_gb: bool) -> Any:
+def _build_mixed(scene: Scene, spec: ForceFieldSpec) -> Any:
     """GAFF2 molecules and chains with residues from GAFF2, alone or beside peptides, water and ions."""
+    from openmm import NonbondedForce
+
     templated: list[IntArray] = []
     others: list[IntArray] = []
     for atoms in molecules_of(scene):
@@ -173,10 +148,8 @@ def _build_mixed(scene: Scene, spec: ForceFieldSpec, native_gb: bool) -> Any:
     parts = []
     if templated:
         atoms = np.sort(np.concatenate(templated))
-        dry = spec.solvent if spec.is_explicit else "vacuum"
-        parts.append(
-            (atoms, build_templated(part_of(scene, atoms), replace(spec, force_field=spec.protein, solvent=dry)))
-        )
+        dry = replace(spec, force_field=spec.protein, solvent=spec.solvent if spec.is_explicit else "vacuum")
+        parts.append((atoms, build_templated(part_of(scene, atoms), dry)))
     small: list[IntArray] = []
     for atoms in others:
         part = part_of(scene, atoms)
@@ -192,35 +165,24 @@ def _build_mixed(scene: Scene, spec: ForceFieldSpec, native_gb: bool) -> Any:
         parts.append((atoms, build(part, spec)))
     system = merge(scene.n_atoms, parts)
     if spec.is_explicit:
-        _use_pme(system, spec)
+        nonbonded = next(f for f in system.getForces() if isinstance(f, NonbondedForce))
+        nonbonded.setNonbondedMethod(NonbondedForce.PME)
+        nonbonded.setCutoffDistance(cutoff_nm(spec.protein)[0])
     if spec.is_born:
         topology = scene.to_openmm_topology()
         if spec.solvent == "gbn2":
             molecule_idx = np.sort(np.concatenate(small)) if small else np.empty(0, dtype=np.int64)
-            system.addForce(implicit_solvent.gbn2(scene, topology, system, molecule_idx=molecule_idx))
+            born = gbn2(scene, topology, system, molecule_idx=molecule_idx)
         else:
-            system.addForce(
-                (implicit_solvent.native_obc2 if native_gb else implicit_solvent.custom_obc2)(topology, system)
-            )
+            born = native_obc2(topology, system)
+        system.addForce(born)
     return system
 
 
 def _build_molecule(scene: Scene, spec: ForceFieldSpec) -> Any:
     """Return the System of one GAFF2 molecule in vacuum."""
-    from openmm import app, unit
+    from openmm import app
 
     return load_openmm(parameters(scene)).createSystem(
-        nonbondedMethod=app.NoCutoff,
-        constraints=app.HBonds if spec.constrain_hydrogens else None,
-        rigidWater=False,
-        removeCMMotion=False,
-        hydrogenMass=None if spec.hydrogen_mass_da is None else spec.hydrogen_mass_da * unit.dalton,
+        nonbondedMethod=app.NoCutoff, rigidWater=False, **spec.openmm_settings()
     )
-
-
-def _use_pme(system: Any, spec: ForceFieldSpec) -> None:
-    from openmm import NonbondedForce
-
-    nonbonded = next(f for f in system.getForces() if isinstance(f, NonbondedForce))
-    nonbonded.setNonbondedMethod(NonbondedForce.PME)
-    nonbonded.setCutoffDistance(cutoff_nm(spec.protein)[0])

@@ -33,11 +33,7 @@ _SOLVENTS = {"alpb-water": "water"}
 
 
 def build_quantum_system(
-    scene: Scene,
-    *,
-    solvent: str = "vacuum",
-    hydrogen_mass_da: float | None = None,
-    constrain_hydrogens: bool = False,
+    scene: Scene, *, solvent: str = "vacuum", hydrogen_mass_da: float | None = None, constrain_hydrogens: bool = False
 ) -> Any:
     """Return an `openmm.System` whose one force is GFN2-xTB, without a cell, in vacuum or `alpb-water`.
 
@@ -105,18 +101,15 @@ class _Compute:
 
 def _hydrogen_bonds(scene: Scene) -> list[tuple[int, int]]:
     """Return the bonds to hydrogen, the hydrogen first."""
-    is_h = [element == "H" for element in scene.elements]
-    return [(i, j) if is_h[i] else (j, i) for i, j in scene.bonds.tolist() if is_h[i] or is_h[j]]
+    bonds = [pair if scene.elements[pair[0]] == "H" else pair[::-1] for pair in map(tuple, scene.bonds.tolist())]
+    return [(hydrogen, other) for hydrogen, other in bonds if scene.elements[hydrogen] == "H"]
 
 
 def _masses_da(scene: Scene, hydrogen_mass_da: float | None) -> FloatArray:
     """Return masses `(n_atoms,)`, hydrogens as heavy as asked for at the cost of what they are bonded to."""
     masses = np.array(scene.masses_da, dtype=np.float64)
-    if hydrogen_mass_da is None:
-        return masses
-    is_h = np.array([element == "H" for element in scene.elements])
-    for hydrogen, other in _hydrogen_bonds(scene):
-        if not is_h[other]:
+    for hydrogen, other in _hydrogen_bonds(scene) if hydrogen_mass_da is not None else ():
+        if scene.elements[other] != "H":
             masses[other] -= hydrogen_mass_da - scene.masses_da[hydrogen]
             masses[hydrogen] = hydrogen_mass_da
     if masses.min() <= 0.0:
@@ -138,18 +131,12 @@ def _minimum_nm(scene: Scene, system: Any) -> FloatArray:
     return np.asarray(context.getState(positions=True).getPositions(asNumpy=True)._value, dtype=np.float64)
 
 
-def _openmp() -> Any:
-    """Return the OpenMP library whose threads tblite takes, torch's where that was loaded before; None without one."""
-    try:
-        return ctypes.CDLL("libgomp.so.1")
-    except OSError:
-        return None
-
-
 @contextmanager
-def _one_thread(openmp: Any) -> Iterator[None]:
+def _one_thread() -> Iterator[None]:
     """Molecules of this size only lose by more threads, which wait in a loop: twice the time, more on busy cores."""
-    if openmp is None:
+    try:  # the library whose threads tblite takes, torch's where that was loaded before
+        openmp = ctypes.CDLL("libgomp.so.1")
+    except OSError:
         yield
         return
     before = openmp.omp_get_max_threads()
@@ -193,7 +180,6 @@ class Potential:
         if solvent in _SOLVENTS:
             self._calculator.add("alpb-solvation", _SOLVENTS[solvent])
         self._scene, self._solvent = scene, solvent
-        self._openmp = _openmp()
 
     def __reduce__(self) -> tuple[type[Potential], tuple[Scene, str]]:
         return Potential, (self._scene, self._solvent)
@@ -201,7 +187,7 @@ class Potential:
     def __call__(self, positions_nm: FloatArray) -> tuple[float, FloatArray]:
         try:
             self._calculator.update(positions=positions_nm / NM_PER_BOHR)
-            with _one_thread(self._openmp):
+            with _one_thread():
                 result = self._calculator.singlepoint()
         except (RuntimeError, ValueError) as error:
             raise PreparationError(

@@ -8,13 +8,12 @@ from functools import cache
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 from scipy.sparse.csgraph import shortest_path
 
 from md_reference.forces.spec import ForceFieldSpec, WaterBox, cutoff_nm
 from systems.chemistry.element_data import atomic_weight_da, covalent_radius_nm
 from systems.errors import InputError, PreparationError
-from systems.scene import FloatArray, Scene
+from systems.scene import FloatArray, IntArray, Scene
 
 # Cells by the distance between periodic images. The dodecahedron has 71 % of the cube's volume, and 71 % of its height.
 _CUBE = np.eye(3)
@@ -71,7 +70,8 @@ def solvate(scene: Scene, spec: ForceFieldSpec, box: WaterBox, *, seed: int = 0,
         )
     solute = scene.positions_nm - centre + cell.sum(axis=0) / 2
     rng = np.random.default_rng(seed)
-    density = _waters_per_nm3(spec.solvent, temperature_k)
+    (density, expansion, growth), warmer = _BULK[spec.solvent], temperature_k - 300.0
+    density *= math.exp(-expansion * warmer - 0.5 * growth * warmer**2)
     solute_nm3 = float(scene.masses_da.sum()) * _NM3_PER_DA
     wanted = math.ceil((volume_nm3 - solute_nm3) * density)
     water = _fill(cell, solute, scene.elements, wanted, rng)
@@ -89,12 +89,6 @@ def solvate(scene: Scene, spec: ForceFieldSpec, box: WaterBox, *, seed: int = 0,
     water = _shaped(water + (scale - 1) * water[:, :1], *_WATER_SHAPES[spec.solvent])
     done = f"solvated: {len(water)} {spec.solvent.upper()} waters, {kinds.count('Na')} Na+, {kinds.count('Cl')} Cl-"
     return _assembled(scene, solute, water, kinds, ions, cell, done, seed)
-
-
-def _waters_per_nm3(solvent: str, temperature_k: float) -> float:
-    density, expansion, growth = _BULK[solvent]
-    warmer = temperature_k - 300.0
-    return density * math.exp(-expansion * warmer - 0.5 * growth * warmer**2)
 
 
 def _diameter_nm(scene: Scene) -> float:
@@ -116,20 +110,11 @@ def require_molecules(spec: ForceFieldSpec) -> None:
 
 
 def solvate_if_asked(
-    scene: Scene,
-    spec: ForceFieldSpec,
-    padding_nm: float | None = None,
-    ionic_strength_molar: float | None = None,
-    *,
-    seed: int = 0,
-    temperature_k: float = 300.0,
+    scene: Scene, spec: ForceFieldSpec, *, seed: int = 0, temperature_k: float = 300.0, **box: float | None
 ) -> Scene:
-    """Return the scene in water where `spec.solvent` is explicit and it has no cell yet, else as it is.
-
-    None is the default of `WaterBox`. Raises InputError for a padding or an ionic strength that nothing would use.
-    """
-    asked = {"padding_nm": padding_nm, "ionic_strength_molar": ionic_strength_molar}
-    given = {name: value for name, value in asked.items() if value is not None}
+    """Return the scene in water where `spec.solvent` is explicit and it has no cell yet, else as it is. `box`: fields
+    of `WaterBox`, None for their defaults. Raises InputError for one that nothing would use."""
+    given = {name: value for name, value in box.items() if value is not None}
     if spec.is_explicit and scene.cell_nm is None:
         return solvate(scene, spec, WaterBox(**given), seed=seed, temperature_k=temperature_k)
     named = " and ".join(f"`{name}`" for name in given)
@@ -195,7 +180,7 @@ def _laid(cell: FloatArray, offset: FloatArray) -> FloatArray:
     return water[((fractions >= 0) & (fractions < 1)).all(axis=1)]
 
 
-def _images(points: FloatArray, cell: FloatArray) -> tuple[FloatArray, npt.NDArray[np.int64]]:
+def _images(points: FloatArray, cell: FloatArray) -> tuple[FloatArray, IntArray]:
     """Return points `(n, 3)` of the cell with their images near its walls, and which point each is."""
     margin = 2 * _WATER_GAP_NM / np.diag(cell)
     fractions = points @ np.linalg.inv(cell)
@@ -208,9 +193,7 @@ def _images(points: FloatArray, cell: FloatArray) -> tuple[FloatArray, npt.NDArr
     return np.concatenate(found), np.concatenate(of)
 
 
-def _ion_sites(
-    oxygens: FloatArray, solute: FloatArray, cell: FloatArray, n: int, rng: np.random.Generator
-) -> npt.NDArray[np.int64]:
+def _ion_sites(oxygens: FloatArray, solute: FloatArray, cell: FloatArray, n: int, rng: np.random.Generator) -> IntArray:
     """Return which waters become ions, `(n,)`: apart from the solute and from each other while there is room."""
     if n > len(oxygens) // 4:
         raise PreparationError(
@@ -255,50 +238,34 @@ def _shaped(water: FloatArray, oh_nm: float, hoh_degrees: float) -> FloatArray:
 
 
 def _assembled(
-    scene: Scene,
-    solute: FloatArray,
-    water: FloatArray,
-    ion_elements: list[str],
-    ions: FloatArray,
-    cell: FloatArray,
-    done: str,
-    seed: int,
-) -> Scene:
-    n, n_water, n_ions = scene.n_atoms, len(water), len(ion_elements)
-    first_residue = len(scene.residue_names)
+    scene: Scene, solute: FloatArray, water: FloatArray, ion_elements: list[str], ions: FloatArray, cell: FloatArray,
+    done: str, seed: int,
+) -> Scene:  # fmt: skip
+    """Return the scene with waters and ions after its own atoms, each a residue of its own, in a chain for either."""
+    n, n_water = scene.n_atoms, len(water)
     oxygens = n + 3 * np.arange(n_water)
     bonds = np.stack([np.stack([oxygens, oxygens + k], axis=1) for k in (1, 2)], axis=1).reshape(-1, 2)
-    elements = (*scene.elements, *(("O", "H", "H") * n_water), *ion_elements)
-    names = (*scene.atom_names, *(("O", "H1", "H2") * n_water), *(e.upper() for e in ion_elements))
+    elements = (*(("O", "H", "H") * n_water), *ion_elements)
+    symbols = [e.upper() for e in ion_elements]
+    residues = np.concatenate([np.repeat(np.arange(n_water), 3), n_water + np.arange(len(ions))])
+    charges = [*[0] * (3 * n_water), *(1 if e == "Na" else -1 for e in ion_elements)]
+    free = [c for c in "WXYZVUTSRQPONMLKJIHGFEDCBA" if c not in scene.chain_of_residue] or ["W1", "W2"]
+    water_chain, ion_chain = (free * 2)[:2]
     provenance: dict[str, Any] = dict(scene.provenance)
     provenance["repairs"] = [*provenance.get("repairs", []), done]
     provenance["solvation"] = {"n_solute_atoms": n, "seed": seed}
-    free = [c for c in "WXYZVUTSRQPONMLKJIHGFEDCBA" if c not in scene.chain_of_residue] or ["W1", "W2"]
-    water_chain, ion_chain = (free * 2)[:2]
     return replace(
         scene,
-        atom_names=names,
-        elements=elements,
-        residue_of_atom=np.concatenate(
-            [
-                scene.residue_of_atom,
-                first_residue + np.repeat(np.arange(n_water), 3),
-                first_residue + n_water + np.arange(n_ions),
-            ]
-        ),
-        residue_names=(*scene.residue_names, *(("HOH",) * n_water), *(e.upper() for e in ion_elements)),
-        residue_ids=(*scene.residue_ids, *map(str, range(1, n_water + 1)), *map(str, range(1, n_ions + 1))),
-        chain_of_residue=(*scene.chain_of_residue, *((water_chain,) * n_water), *((ion_chain,) * n_ions)),
+        atom_names=(*scene.atom_names, *(("O", "H1", "H2") * n_water), *symbols),
+        elements=scene.elements + elements,
+        residue_of_atom=np.concatenate([scene.residue_of_atom, len(scene.residue_names) + residues]),
+        residue_names=(*scene.residue_names, *(("HOH",) * n_water), *symbols),
+        residue_ids=(*scene.residue_ids, *map(str, [*range(1, n_water + 1), *range(1, len(ions) + 1)])),
+        chain_of_residue=(*scene.chain_of_residue, *((water_chain,) * n_water), *((ion_chain,) * len(ions))),
         bonds=np.concatenate([scene.bonds, bonds]),
         bond_orders=np.concatenate([scene.bond_orders, np.ones(len(bonds))]),
-        formal_charges=np.concatenate(
-            [
-                scene.formal_charges,
-                np.zeros(3 * n_water, dtype=np.int64),
-                np.array([1 if e == "Na" else -1 for e in ion_elements], dtype=np.int64),
-            ]
-        ),
-        masses_da=np.concatenate([scene.masses_da, [atomic_weight_da(e) for e in elements[n:]]]),
+        formal_charges=np.concatenate([scene.formal_charges, np.array(charges, dtype=np.int64)]),
+        masses_da=np.concatenate([scene.masses_da, [atomic_weight_da(e) for e in elements]]),
         positions_nm=np.concatenate([solute, water.reshape(-1, 3), ions.reshape(-1, 3)]),
         provenance=provenance,
         cell_nm=cell,

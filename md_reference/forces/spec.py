@@ -71,16 +71,12 @@ class ForceFieldSpec:
     constrain_hydrogens: bool = True
 
     def __post_init__(self) -> None:
-        if self.force_field not in FORCE_FIELDS:
-            raise UnknownNameError(
-                f"unknown force field {self.force_field!r}; known: {', '.join(FORCE_FIELDS)}."
-                + nearest(self.force_field, list(FORCE_FIELDS))
-            )
-        if self.solvent not in SOLVENTS:
-            raise UnknownNameError(
-                f"unknown solvent {self.solvent!r}; known: {', '.join(SOLVENTS)}."
-                + nearest(self.solvent, list(SOLVENTS))
-            )
+        for what, name, known in (
+            ("force field", self.force_field, FORCE_FIELDS), ("solvent", self.solvent, SOLVENTS)
+        ):  # fmt: skip
+            if name not in known:
+                meant = nearest(name, list(known))
+                raise UnknownNameError(f"unknown {what} {name!r}; known: {', '.join(known)}.{meant}")
         if self.solvent == "amber99-obc" and self.force_field != "ff99SB-ILDN":
             raise PreparationError("solvent 'amber99-obc' goes with `force_field='ff99SB-ILDN'`; use obc2 otherwise.")
         if self.solvent in QUANTUM_SOLVENTS and self.force_field != QUANTUM:
@@ -123,25 +119,33 @@ class ForceFieldSpec:
         name = self.force_field.removesuffix("+gaff2")
         return name if name in PROTEIN_FORCE_FIELDS else "ff14SB"
 
+    def openmm_settings(self) -> dict[str, Any]:
+        """Return constraints and hydrogen masses as `createSystem` of OpenMM's force fields takes them."""
+        from openmm import app, unit
+
+        mass = self.hydrogen_mass_da
+        return {
+            "constraints": app.HBonds if self.constrain_hydrogens else None,
+            "hydrogenMass": None if mass is None else mass * unit.dalton,
+            "removeCMMotion": False,
+        }
+
     @property
     def warnings(self) -> tuple[str, ...]:
         """What is known to go badly together, one line each."""
-        found = []
-        name = self.protein
+        name, solvent = self.protein, self.solvent
         if self.is_born and name == "ff19SB":
-            found.append(f"ff19SB is tuned for OPC water; with {self.solvent} helices and turns are off. Use ff14SB.")
+            return (f"ff19SB is tuned for OPC water; with {solvent} helices and turns are off. Use ff14SB.",)
         if self.is_born and name == "charmm36":
-            found.append(f"charmm36 was not made for {self.solvent}, whose radii are Amber's. Use ff14SB, or tip3p.")
-        if self.solvent == "tip3p" and name == "ff19SB":
-            found.append("ff19SB is tuned for OPC water; use `solvent='opc'`.")
-        return tuple(found)
+            return (f"charmm36 was not made for {solvent}, whose radii are Amber's. Use ff14SB, or tip3p.",)
+        if solvent == "tip3p" and name == "ff19SB":
+            return ("ff19SB is tuned for OPC water; use `solvent='opc'`.",)
+        return ()
 
 
 def at_level(level: str | None, force_field: str | None) -> str | None:
-    """Return the force field that a level of theory ('mm', 'gfn2-xtb' or None) leaves or demands.
-
-    Raises UnknownNameError, and InputError where the two contradict each other.
-    """
+    """Return the force field that a level of theory ('mm', 'gfn2-xtb' or None) leaves or demands. Raises
+    UnknownNameError, and InputError where the two contradict each other."""
     if level is None:
         return force_field
     if level not in ("mm", QUANTUM):
@@ -174,9 +178,6 @@ _WATER_FILES = {
               "charmm36": "charmm36/water.xml"},
     "opc": {"ff14SB": "amber14/opc.xml", "ff19SB": "amber19/opc.xml", "ff99SB-ILDN": "amber14/opc.xml"},
 }  # fmt: skip
-# (cut-off, start of the switching function or None), nm: Amber's and CHARMM's own practice.
-CUTOFFS_NM = {"charmm36": (1.2, 1.0)}
-DEFAULT_CUTOFF_NM: tuple[float, float | None] = (0.9, None)
 
 
 def water_file(protein: str, solvent: str) -> str | None:
@@ -190,8 +191,9 @@ def chain_files(protein: str) -> tuple[str, ...]:
 
 
 def cutoff_nm(protein: str) -> tuple[float, float | None]:
-    """Return the cut-off of direct interactions in a periodic cell and where it starts to act, in nm."""
-    return CUTOFFS_NM.get(protein, DEFAULT_CUTOFF_NM)
+    """Return the cut-off of direct interactions in a periodic cell and where switching starts, in nm: Amber's and
+    CHARMM's own practice."""
+    return (1.2, 1.0) if protein == "charmm36" else (0.9, None)
 
 
 @cache

@@ -1,4 +1,4 @@
-"""Peptides, sugars, water and ions: Systems from OpenMM's residue templates.
+"""Peptides, sugars, water and ions: Systems from OpenMM's residue templates, with generalised Born terms.
 
 GLYCAM_06j-1 (Kirschner et al., J. Comput. Chem. 29, 622 (2008)) has a template for each sugar, anomer and set of linked
 oxygens; epimers have the same bonds, so that bonds alone do not tell them apart, but names, links and handedness do.
@@ -14,9 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from md_reference.forces import implicit_solvent
-from md_reference.forces.mixture import is_water, molecules_of
-from md_reference.forces.regrouping import permuted, regroup
+from md_reference.forces.mixture import is_water, molecules_of, permuted, regroup
 from md_reference.forces.spec import (
     ForceFieldSpec,
     chain_files,
@@ -26,8 +24,8 @@ from md_reference.forces.spec import (
     water_file,
 )
 from systems.chemistry.geometry import signed_volumes
-from systems.errors import InputError, PreparationError
-from systems.scene import Scene
+from systems.errors import InputError, PreparationError, first_line
+from systems.scene import IntArray, Scene
 
 GLYCAM_FILE = "amber14/GLYCAM_06j-1.xml"
 # Names in the Protein Data Bank: GLYCAM's letters of sugar and anomer, and the handedness of C1 to C5 (the sign of the
@@ -56,14 +54,12 @@ def glycan_templates(scene: Scene) -> dict[int, str]:
     Others, a free reducing end among them, are left out.
     """
     found = {}
-    members: list[list[int]] | None = None
     for r, name in enumerate(scene.residue_names):
-        if name not in SUGARS and name not in _named_as_glycam(name):
-            continue
-        if members is None:
-            members = _members(scene)
-        code = name if name not in SUGARS else _code(scene, name, members[r])
-        if code in glycam_names():
+        if name in SUGARS:
+            code = _code(scene, name, np.flatnonzero(scene.residue_of_atom == r).tolist())
+        else:  # sugars as GLYCAM writes them: three characters, the last an anomer
+            code = name if re.fullmatch(r"[0-9P-Z][A-Za-z][AB]", name) else ""
+        if code and code in glycam_names():
             found[r] = code
     return found
 
@@ -87,30 +83,17 @@ def _code(scene: Scene, name: str, atoms: list[int]) -> str:
     at = {scene.atom_names[i]: i for i in atoms}
     letters, signs = SUGARS[name]
     hydrogen = {a: next((j for j in near[at[a]] if scene.elements[j] == "H"), -1) for a in at if a[0] == "C"}
-    own = set(atoms)
     for (centre, a, b, _), sign in zip(CENTRES, signs, strict=True):
         if sign == ".":
             continue
         row = [at.get(centre, -1), at.get(a, -1), at.get(b, -1), hydrogen.get(centre, -1)]
         if min(row) < 0 or (signed_volumes(scene.positions_nm, [row])[0] > 0) != (sign == "+"):
             return ""
-    beyond = {a for a, i in at.items() if any(j not in own for j in near[i])}
+    beyond = {a for a, i in at.items() if set(near[i]) - set(atoms)}
     if "C1" not in beyond or not all(a == "C1" or re.fullmatch(r"O[2346]", a) for a in beyond):
         return ""
     links = "".join(sorted(a[1] for a in beyond if a[0] == "O"))
     return _LINKS.get(links, "?") + letters
-
-
-def _members(scene: Scene) -> list[list[int]]:
-    out: list[list[int]] = [[] for _ in scene.residue_names]
-    for i, r in enumerate(scene.residue_of_atom.tolist()):
-        out[r].append(i)
-    return out
-
-
-def _named_as_glycam(name: str) -> frozenset[str]:
-    """Names of sugars as GLYCAM writes them: three characters, the last an anomer."""
-    return glycam_names() if re.fullmatch(r"[0-9P-Z][A-Za-z][AB]", name) else frozenset()
 
 
 @cache
@@ -134,7 +117,7 @@ class Unmatched(Exception):
         super().__init__(self.residue)
 
 
-def build_templated(scene: Scene, spec: ForceFieldSpec, *, native_gb: bool = True) -> Any:
+def build_templated(scene: Scene, spec: ForceFieldSpec) -> Any:
     """Return the `openmm.System` of a scene that the templates of `spec.force_field` cover, implicit solvent included.
 
     Where the scene's own division into residues is not known to the force field, the one found in the bond graph is
@@ -143,13 +126,13 @@ def build_templated(scene: Scene, spec: ForceFieldSpec, *, native_gb: bool = Tru
     """
     scene = _with_water_named(scene)
     try:
-        return _build(scene, spec, native_gb)
+        return _build(scene, spec)
     except (Unmatched, InputError) as error:
         if isinstance(error, PreparationError):
             raise
         regrouped, order = regroup(scene)
     try:
-        return permuted(_build(regrouped, spec, native_gb), order)
+        return permuted(_build(regrouped, spec), order)
     except Unmatched as error:
         advice = (
             "hydrogens as they are; leave `force_field` out, or give `force_field='ff14SB+gaff2'`, for residues that "
@@ -177,27 +160,28 @@ def uncovered_residue(scene: Scene, protein: str) -> str | None:
     return _describe(scene, found[0]) if found else None
 
 
-def _build(scene: Scene, spec: ForceFieldSpec, native_gb: bool) -> Any:
+def _build(scene: Scene, spec: ForceFieldSpec) -> Any:
     """Return the System of a scene whose residues the force field knows; raises Unmatched for one it does not."""
     from openmm import app, unit
 
-    if spec.force_field == "charmm36":
+    is_charmm = spec.force_field == "charmm36"
+    if is_charmm:
         scene = _with_caps_joined(scene)
     topology = scene.to_openmm_topology()
-    wanted = [*chain_files(spec.force_field)]
-    needs_water = spec.is_explicit or any(len(m) == 1 or is_water(scene.elements, m) for m in molecules_of(scene))
-    water = water_file(spec.force_field, spec.solvent) if needs_water else None
-    if water is not None:
-        wanted.append(water)
-    if spec.solvent == "amber99-obc":
-        wanted.append("amber99_obc.xml")
-    elif spec.solvent == "obc2" and not native_gb:
-        wanted.append("implicit/obc2.xml")
     names = glycan_templates(scene) if spec.force_field == "ff14SB" else {}
+    wanted = [*chain_files(spec.force_field)]
     if names:
         wanted.insert(1, GLYCAM_FILE)
         # GLYCAM has an acetyl, ACX, with the bonds of ACE.
         names |= {r: "ACE" for r, name in enumerate(scene.residue_names) if name == "ACE"}
+    if is_charmm:  # capped alanine is in its files twice; ALAD is the one with the protein's types
+        names = {r.index: "ALAD" for r in topology.residues() if r.name == "ALA" and len(r) == 22}
+    templates = {residue: names[residue.index] for residue in topology.residues() if residue.index in names}
+    needs_water = spec.is_explicit or any(len(m) == 1 or is_water(scene.elements, m) for m in molecules_of(scene))
+    if needs_water and (water := water_file(spec.force_field, spec.solvent)):
+        wanted.append(water)
+    if spec.solvent == "amber99-obc":
+        wanted.append("amber99_obc.xml")
     force_field = force_field_of(tuple(wanted))
     settings: dict[str, Any] = {"nonbondedMethod": app.NoCutoff}
     if spec.is_explicit:
@@ -206,56 +190,37 @@ def _build(scene: Scene, spec: ForceFieldSpec, native_gb: bool) -> Any:
         settings = {"nonbondedMethod": app.PME, "nonbondedCutoff": far_nm * unit.nanometer}
         if near_nm is not None:
             settings["switchDistance"] = near_nm * unit.nanometer
-    real: list[int] = list(range(scene.n_atoms))
+    real = list(range(scene.n_atoms))
+    # CHARMM's terminal residues are patches, which only createSystem tries; sugars have names, not bonds alone.
+    if spec.solvent != "opc" and not is_charmm and not names:
+        for residue in force_field.getUnmatchedResidues(topology):
+            raise Unmatched(scene, residue.index)
     try:
-        if spec.solvent == "opc":
-            topology, real = _with_virtual_sites(topology, scene, force_field, names)
-        elif spec.force_field != "charmm36" and not names:
-            # CHARMM's terminal residues are patches, which only createSystem tries; sugars have names, not bonds alone.
-            for residue in force_field.getUnmatchedResidues(topology):
-                raise Unmatched(scene, residue.index)
+        if spec.solvent == "opc":  # whose waters have a virtual site
+            modeller = app.Modeller(topology, scene.positions_nm * unit.nanometer)
+            modeller.addExtraParticles(force_field, residueTemplates=templates)
+            topology = modeller.topology
+            templates = {residue: names[residue.index] for residue in topology.residues() if residue.index in names}
+            real = [a.index for a in topology.atoms() if a.element is not None]
         system = force_field.createSystem(
-            topology,
-            residueTemplates=_chosen_templates(topology)
-            if spec.force_field == "charmm36"
-            else _by_residue(topology, names),
-            **settings,
-            constraints=app.HBonds if spec.constrain_hydrogens else None,
-            rigidWater=True,
-            removeCMMotion=False,
-            hydrogenMass=None if spec.hydrogen_mass_da is None else spec.hydrogen_mass_da * unit.dalton,
+            topology, residueTemplates=templates, rigidWater=True, **settings, **spec.openmm_settings()
         )
-    except Unmatched:
-        raise
     except Exception as error:  # OpenMM raises KeyError, ValueError and bare Exception here
-        reason = (str(error).splitlines() or ["no reason given"])[0]
-        absent = re.match(r"No template found for residue (\d+)", reason)
-        if absent:
+        if absent := re.match(r"No template found for residue (\d+)", str(error)):
             raise Unmatched(scene, int(absent[1])) from error
-        raise PreparationError(f"{spec.force_field} cannot describe scene {scene.name!r}: {reason}") from error
-    if spec.solvent == "obc2" and native_gb:
-        system.addForce(implicit_solvent.native_obc2(topology, system))
+        raise PreparationError(
+            f"{spec.force_field} cannot describe scene {scene.name!r}: {first_line(error)}."
+        ) from error
+    if spec.solvent == "obc2":
+        system.addForce(native_obc2(topology, system))
     elif spec.solvent == "gbn2":
-        system.addForce(implicit_solvent.gbn2(scene, topology, system))
+        system.addForce(gbn2(scene, topology, system))
     if len(real) != system.getNumParticles():
         virtual = sorted(set(range(system.getNumParticles())) - set(real))
         order = np.empty(system.getNumParticles(), dtype=np.int64)
         order[[*real, *virtual]] = np.arange(len(order))
         system = permuted(system, order)
     return system
-
-
-def _by_residue(topology: Any, names: dict[int, str]) -> dict[Any, str]:
-    return {residue: names[residue.index] for residue in topology.residues() if residue.index in names}
-
-
-def _with_virtual_sites(topology: Any, scene: Scene, force_field: Any, names: dict[int, str]) -> tuple[Any, list[int]]:
-    """Return the topology with the force field's extra particles in place, and which of its particles are atoms."""
-    from openmm import app, unit
-
-    modeller = app.Modeller(topology, scene.positions_nm * unit.nanometer)
-    modeller.addExtraParticles(force_field, residueTemplates=_by_residue(topology, names))
-    return modeller.topology, [a.index for a in modeller.topology.atoms() if a.element is not None]
 
 
 def _with_water_named(scene: Scene) -> Scene:
@@ -283,13 +248,67 @@ def _with_caps_joined(scene: Scene) -> Scene:
     )
 
 
-def _chosen_templates(topology: Any) -> dict[Any, str]:
-    """Capped alanine is in CHARMM's files twice; ALAD is the one with the protein's types."""
-    return {residue: "ALAD" for residue in topology.residues() if residue.name == "ALA" and len(residue) == 22}
-
-
 def _describe(scene: Scene, residue: int) -> str:
     """`residue UNL 1 (C9 H8 O4)`, for messages."""
     symbols = [e for e, r in zip(scene.elements, scene.residue_of_atom, strict=True) if r == residue]
     formula = " ".join(f"{e}{symbols.count(e) if symbols.count(e) > 1 else ''}" for e in sorted(set(symbols)))
     return f"residue {scene.residue_names[residue]} {scene.residue_ids[residue]} ({formula})"
+
+
+# ---- generalised Born terms ------------------------------------------------------------------------------------------
+
+
+def native_obc2(topology: Any, system: Any) -> Any:
+    """OBC2 (Onufriev, Bashford and Case 2004, igb=5) as GBSAOBCForce. Charges from the NonbondedForce, radii (mbondi2)
+    and scales from OpenMM's standard OBC2 table."""
+    from openmm import GBSAOBCForce
+    from openmm.app.internal.customgbforces import GBSAOBC2Force
+
+    gb = GBSAOBCForce()
+    gb.setNonbondedMethod(GBSAOBCForce.NoCutoff)
+    gb.setSoluteDielectric(1.0)
+    gb.setSolventDielectric(78.5)
+    charges = _charges(system)
+    for index, (radius_nm, scale) in enumerate(GBSAOBC2Force.getStandardParameters(topology)):
+        gb.addParticle(charges[index], radius_nm, scale)
+    return gb
+
+
+def gbn2(scene: Scene, topology: Any, system: Any, *, molecule_idx: IntArray | None = None) -> Any:
+    """GBn2 (Nguyen, Roe and Simmerling 2013, igb=8) as OpenMM's CustomGBForce, radii mbondi3.
+
+    Atoms in `molecule_idx` (GAFF2) keep their mbondi2 radii: Amber changes those of protein residues alone. Arginine is
+    known by its bonds, so that a peptide in residues of other names gets the same energy.
+    """
+    from openmm.app.internal.customgbforces import GBSAGBn2Force, GBSAOBC2Force
+
+    gb = GBSAGBn2Force(SA="ACE")
+    parameters = [list(map(float, row)) for row in GBSAGBn2Force.getStandardParameters(topology)]
+    for i in _guanidinium_hydrogens(scene):
+        parameters[i][0] = 0.117  # nm, of Amber's radius set mbondi3
+    if molecule_idx is not None and len(molecule_idx):
+        plain = GBSAOBC2Force.getStandardParameters(topology)
+        for i in molecule_idx.tolist():
+            parameters[i][0] = float(plain[i][0])
+    for charge, row in zip(_charges(system), parameters, strict=True):
+        gb.addParticle([charge, *row])
+    gb.finalize()
+    return gb
+
+
+def _charges(system: Any) -> list[Any]:
+    from openmm import NonbondedForce
+
+    nonbonded = next(f for f in system.getForces() if isinstance(f, NonbondedForce))
+    return [nonbonded.getParticleParameters(i)[0] for i in range(nonbonded.getNumParticles())]
+
+
+def _guanidinium_hydrogens(scene: Scene) -> list[int]:
+    """Hydrogens on the nitrogens of carbons that have three of them."""
+    near, symbol = scene.neighbours(), scene.elements
+    found = []
+    for c in (i for i, e in enumerate(symbol) if e == "C"):
+        nitrogens = [n for n in near[c] if symbol[n] == "N"]
+        if len(nitrogens) == 3:
+            found += [h for n in nitrogens for h in near[n] if symbol[h] == "H"]
+    return found

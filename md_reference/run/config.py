@@ -16,7 +16,7 @@ from md_reference.forces.spec import QUANTUM, ForceFieldSpec
 from systems.errors import InputError, UnknownNameError, nearest
 from systems.files.outside import check_disk
 from systems.options import option
-from systems.units import format_time_ps, whole_steps
+from systems.units import format_quantity, format_time_ps, stem_of, unit_of, whole_steps
 
 if TYPE_CHECKING:
     from systems.scene import IntArray, Scene
@@ -24,7 +24,6 @@ if TYPE_CHECKING:
 
 # What `platform` says for replicas in vector registers (`md_reference.simd`); to OpenMM it is none.
 SIMD = "simd"
-ENSEMBLES = ("nvt", "nve", "npt")
 
 
 @dataclass(frozen=True)
@@ -81,8 +80,7 @@ class MDConfig(Conditions):
     @property
     def columns(self) -> tuple[str, ...]:
         """What is stored of each frame beside positions."""
-        wanted = {"velocities": self.save_velocities, "forces": self.save_forces}
-        return tuple(name for name, asked in wanted.items() if asked)
+        return ("velocities",) * self.save_velocities + ("forces",) * self.save_forces
 
 
 def settings_of(config: MDConfig) -> dict[str, Any]:
@@ -92,17 +90,9 @@ def settings_of(config: MDConfig) -> dict[str, Any]:
     return {**flat, **force}
 
 
-def flat_settings(config: MDConfig) -> dict[str, Any]:
-    """Return what `settings_of` does but the seed, which belongs to a run's place among others."""
-    return {key: value for key, value in settings_of(config).items() if key != "seed"}
-
-
 def check_same_run(old: dict[str, Any], config: MDConfig, out: Path, *, ignoring: tuple[str, ...] = ()) -> None:
-    """Raise InputError unless a record or a checkpoint states the settings of `config`.
-
-    A setting that an older version did not know counts as its default. A run may be resumed to become longer, never
-    shorter.
-    """
+    """Raise InputError unless a record or a checkpoint states the settings of `config`. A setting that an older version
+    did not know counts as its default. A run may be resumed to become longer, never shorter."""
     before = settings_of(MDConfig(time_ps=config.time_ps)) | old
     for key, value in json.loads(json.dumps(settings_of(config))).items():
         if key not in ("time_ps", *ignoring) and before.get(key) != value:
@@ -111,11 +101,11 @@ def check_same_run(old: dict[str, Any], config: MDConfig, out: Path, *, ignoring
                 "or write to another file."
             )
     asked_ps = before["time_ps"]
-    if not isinstance(asked_ps, int | float) or config.time_ps < asked_ps:
-        length = format_time_ps(asked_ps) if isinstance(asked_ps, int | float) else repr(asked_ps)
+    is_time = isinstance(asked_ps, int | float)
+    if not is_time or config.time_ps < asked_ps:
         raise InputError(
-            f"{out} was started for {length} and cannot become shorter; resume with as much or more, or write to "
-            "another file."
+            f"{out} was started for {format_time_ps(asked_ps) if is_time else repr(asked_ps)} and cannot become "
+            "shorter; resume with as much or more, or write to another file."
         )
 
 
@@ -128,26 +118,22 @@ def resolved(scene: Scene, config: MDConfig) -> MDConfig:
     """
     from md_reference.forces.forcefield import resolve  # the builders of forces are slow to import
 
-    if config.keep not in ("auto", "solute", "all"):
-        raise UnknownNameError(f"unknown `keep` {config.keep!r}; known: solute, all, auto.")
-    ensemble = config.ensemble.lower()
-    if ensemble not in ENSEMBLES:
-        raise UnknownNameError(
-            f"unknown ensemble {config.ensemble!r}; known: {', '.join(ENSEMBLES)}." + nearest(ensemble, list(ENSEMBLES))
-        )
-    if ensemble == "npt" and scene.cell_nm is None:
+    config = replace(config, ensemble=config.ensemble.lower())
+    for what, value, known in (("ensemble", config.ensemble, ("nvt", "nve", "npt")),
+                               ("`keep`", config.keep, ("auto", "solute", "all"))):  # fmt: skip
+        if value not in known:
+            raise UnknownNameError(f"unknown {what} {value!r}; known: {', '.join(known)}.{nearest(value, list(known))}")
+    if config.ensemble == "npt" and scene.cell_nm is None:
         raise InputError(
             f"ensemble npt needs a volume, and scene {scene.name!r} has no periodic cell; use nvt, or give an explicit "
             "`solvent`."
         )
-    return replace(config, force=resolve(scene, config.force), ensemble=ensemble)
+    return replace(config, force=resolve(scene, config.force))
 
 
 def check_run(scene: Scene, config: MDConfig, out: Path) -> MDConfig:
-    """Return the settings `resolved` for this scene, before anything is computed.
-
-    Raises UnitError for uneven intervals, InputError for what `out` cannot hold or the scene cannot have.
-    """
+    """Return the settings `resolved` for this scene, before anything is computed. Raises UnitError for uneven
+    intervals, InputError for what `out` cannot hold or the scene cannot have."""
     _ = config.steps_per_frame
     config = resolved(scene, config)
     kept = config.kept_atoms(scene)
@@ -169,15 +155,6 @@ LONGEST_QUANTUM_STEP_PS = 0.004
 _HYDROGEN_MASS_DA = 3.0
 _FLEXIBLE_QUANTUM_STEP_PS = 0.0005
 _QUANTUM_EQUILIBRATION_PS = 1.0
-_WORDS = {
-    "force_field": "force field",
-    "temperature_k": "temperature",
-    "friction_per_ps": "friction",
-    "timestep_ps": "time step",
-    "hydrogen_mass_da": "hydrogen mass",
-    "save_every_ps": "saved every",
-    "equilibrate_ps": "equilibration",
-}
 
 
 def defaults() -> dict[str, Any]:
@@ -219,8 +196,8 @@ def resolve_by_name(name: str, given: Mapping[str, Any], protocol: str | None = 
 
 
 def to_config(values: Mapping[str, Any], *, seed: int) -> MDConfig:
-    """Return a run of these settings, by the names of MDConfig and ForceFieldSpec; forces left open are settled for its
-    scene later. Raises InputError where its length is not given, and what the fields refuse."""
+    """Return a run of these settings, by the names of MDConfig and ForceFieldSpec; forces left open are resolved
+    for its scene later. Raises InputError where its length is not given, and what the fields refuse."""
     if "time_ps" not in values:
         raise InputError("time is missing; write, for example, time = '10ns'.")
     of_forces = {f.name for f in fields(ForceFieldSpec)}
@@ -236,12 +213,8 @@ def _of_quantum(asked: Mapping[str, Any]) -> dict[str, Any]:
     if step_ps > LONGEST_QUANTUM_STEP_PS:
         raise InputError(f"{format_time_ps(step_ps)} is too long for {QUANTUM}; use `timestep_ps='4fs'` or less.")
     is_long = step_ps > LONGEST_FLEXIBLE_STEP_PS
-    return {
-        "timestep_ps": step_ps,
-        "equilibrate_ps": _QUANTUM_EQUILIBRATION_PS,
-        "hydrogen_mass_da": _HYDROGEN_MASS_DA if is_long else None,
-        "constrain_hydrogens": is_long,
-    }
+    heavy = {"hydrogen_mass_da": _HYDROGEN_MASS_DA if is_long else None, "constrain_hydrogens": is_long}
+    return {"timestep_ps": step_ps, "equilibrate_ps": _QUANTUM_EQUILIBRATION_PS, **heavy}
 
 
 def _decisive(name: str, protocol: str | None) -> tuple[dict[str, Any], tuple[str, str]]:
@@ -258,15 +231,5 @@ def _decisive(name: str, protocol: str | None) -> tuple[dict[str, Any], tuple[st
 
 
 def _say(key: str, value: Any) -> str:
-    word = _WORDS.get(key, key)
-    if key.endswith("_per_ps"):
-        return f"{word} {value:g}/ps"
-    if key.endswith("_ps"):
-        return f"no {word}" if value == 0 else f"{word} {format_time_ps(value)}"
-    if key.endswith("_k"):
-        return f"{word} {value:g} K"
-    if key == "hydrogen_mass_da":
-        return "natural hydrogen mass" if value is None else f"{word} {value:g} Da"
-    if key == "constrain_hydrogens":
-        return f"bonds to hydrogen {'rigid' if value else 'flexible'}"
-    return f"{word} {value}"
+    text = "natural" if value is None else format_quantity(key, value) if unit_of(key) else str(value)
+    return f"{stem_of(key).replace('_', ' ')} {text}"

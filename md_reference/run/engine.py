@@ -1,8 +1,10 @@
-"""An OpenMM Context behind six verbs: energy, forces, minimise, step, state, close."""
+"""A scene in an OpenMM Context: energies, forces, minimisation, steps; and relaxation of the stiff bonds of a frame."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
@@ -14,8 +16,7 @@ from md_reference.forces.mixture import solute_of
 from md_reference.forces.quantum import refuse_rearranged
 from md_reference.forces.spec import QUANTUM
 from md_reference.run.config import Conditions
-from md_reference.run.machine import platform_properties
-from md_reference.run.platforms import choose_platform
+from md_reference.run.machine import choose_platform, make_context
 from systems.chemistry.element_data import covalent_radius_nm
 from systems.chemistry.geometry import signed_volumes
 from systems.chemistry.graph import stereocentres
@@ -28,6 +29,11 @@ _FLAT_NM3 = 2e-4
 _STEPS_BETWEEN_VOLUME_MOVES = 25
 # A bond is broken that is longer than so many sums of covalent radii; the longest of a minimised molecule are 1.1.
 _BROKEN = 1.25
+# Each atom's spring in `Relaxer`. Bonds are a hundred times stiffer, so that a bond 0.05 nm off comes back to within
+# 0.001 nm of its rest, where an atom pulled by kT strays 0.03 nm.
+_SPRING_KJ_MOL_NM2 = 2500.0
+_CONSTRAINT_TOLERANCE = 1e-5
+_SPRINGS_GROUP = 31
 
 
 @dataclass(frozen=True)
@@ -48,9 +54,16 @@ class State:
     cell_nm: FloatArray | None = None
 
 
-def one_line(error: Exception) -> str:
-    """Return the first line of an OpenMM error, without the advice and the web address behind it."""
-    return first_line(error).split("  For more information")[0].rstrip(".")
+@contextmanager
+def _openmm_errors(what: str) -> Iterator[None]:
+    """Turn an error of OpenMM into `what: reason`, one line without the advice and the web address behind it."""
+    import openmm
+
+    try:
+        yield
+    except openmm.OpenMMException as error:
+        reason = first_line(error).split("  For more information")[0].rstrip(".")
+        raise SimulationError(f"{what}: {reason}") from error
 
 
 def refuse_damaged(scene: Scene, minimised_nm: FloatArray) -> None:
@@ -95,20 +108,12 @@ class Engine:
     """One scene, one force field, one integrator, one Context. Use as a context manager or call `close`.
 
     `conditions`: force field and ensemble resolved for the scene (`config.resolved`). `threads`: of the CPU platform,
-    where they are settled. `native_gb`: see `build_system`. `system`: what that returned for this scene and these
-    forces, where it is there already; a barostat is added to it. Virtual sites are placed here and appear nowhere else.
+    where they are chosen. `system`: what `build_system` returned for this scene and these forces, where it is there
+    already; a barostat is added to it. Virtual sites are placed here and appear nowhere else.
     Raises what `build_system` raises, and SimulationError when the platform cannot run the scene.
     """
 
-    def __init__(
-        self,
-        scene: Scene,
-        conditions: Conditions,
-        *,
-        threads: int | None = None,
-        native_gb: bool = True,
-        system: Any = None,
-    ) -> None:
+    def __init__(self, scene: Scene, conditions: Conditions, *, threads: int | None = None, system: Any = None) -> None:
         import openmm
 
         self.ensemble = conditions.ensemble
@@ -116,38 +121,29 @@ class Engine:
         self.spec = conditions.force
         choice = choose_platform(scene.n_atoms, conditions.platform, born=self.spec.solvent != "vacuum")
         self.platform_name, self.threads = choice.name, threads or choice.threads
-        self._system = build_system(scene, self.spec, native_gb=native_gb) if system is None else system
+        self._system = build_system(scene, self.spec) if system is None else system
         # OpenMM reads a seed of 0 as "choose one from the clock".
         self._seed = conditions.seed % (2**31 - 1) + 1
         self._temperature_k = conditions.temperature_k
-        if self.ensemble == "npt":
-            add_barostat(
-                self._system,
-                pressure_bar=conditions.pressure_bar,
-                temperature_k=self._temperature_k,
-                seed=self._seed,
-            )
-        self._integrator = make_integrator(
-            self._system,
-            self.ensemble,
-            temperature_k=self._temperature_k,
-            friction_per_ps=conditions.friction_per_ps,
-            timestep_ps=conditions.timestep_ps,
-        )
+        if self.ensemble == "npt":  # Åqvist et al., Chem. Phys. Lett. 384, 288 (2004)
+            pressure = conditions.pressure_bar, self._temperature_k, _STEPS_BETWEEN_VOLUME_MOVES
+            barostat = openmm.MonteCarloBarostat(*pressure)
+            barostat.setRandomNumberSeed(self._seed)
+            self._system.addForce(barostat)
+        if self.ensemble == "nve":
+            constrained = self._system.getNumConstraints() > 0
+            self._integrator = _velocity_verlet(conditions.timestep_ps, constrained=constrained)
+        else:
+            bath = self._temperature_k, conditions.friction_per_ps, conditions.timestep_ps
+            self._integrator = openmm.LangevinMiddleIntegrator(*bath)
         self._integrator.setRandomNumberSeed(self._seed)
-        properties = platform_properties(self.platform_name, self.threads)
-        try:
-            self._context: Any = openmm.Context(
-                self._system, self._integrator, openmm.Platform.getPlatform(self.platform_name), properties
-            )
-        except openmm.OpenMMException as error:
-            raise SimulationError(f"platform {choice.name} cannot run {scene.name!r}: {one_line(error)}") from error
+        with _openmm_errors(f"platform {choice.name} cannot run {scene.name!r}"):
+            self._context: Any = make_context(self._system, self._integrator, choice.name, self.threads)
         masses = [self._system.getParticleMass(k)._value for k in range(self._system.getNumParticles())]
         self._masses_da = np.array(masses, dtype=np.float64)
         self.set_positions(scene.positions_nm)
-        self._n_dof = 3 * int(np.count_nonzero(self._masses_da)) - self.n_constraints
-        if self._keeps_momentum:
-            self._n_dof -= 3
+        # Degrees of freedom that hold kinetic energy; without a bath those of the centre of mass are at rest.
+        self.n_dof = 3 * int(np.count_nonzero(self._masses_da)) - self.n_constraints - 3 * self._keeps_momentum
 
     def __enter__(self) -> Engine:
         return self
@@ -160,28 +156,18 @@ class Engine:
         return int(self._system.getNumConstraints())
 
     @property
-    def n_dof(self) -> int:
-        """Degrees of freedom that hold kinetic energy; without a bath those of the centre of mass are at rest."""
-        return self._n_dof
-
-    @property
     def _keeps_momentum(self) -> bool:
         return self.ensemble == "nve" and self.scene.interactions is None
-
-    @property
-    def _n_virtual(self) -> int:
-        return len(self._masses_da) - self.scene.n_atoms
 
     def _with_virtual(self, values: npt.ArrayLike) -> FloatArray:
         """Append a row of zeros for each virtual site to per-atom vectors."""
         given = np.asarray(values, dtype=np.float64)
-        return np.concatenate([given, np.zeros((self._n_virtual, 3))]) if self._n_virtual else given
+        return np.concatenate([given, np.zeros((len(self._masses_da) - len(given), 3))])
 
     def set_positions(self, positions_nm: npt.ArrayLike) -> None:
         """Place the atoms, `(n_atoms, 3)` nm."""
         self._context.setPositions(self._with_virtual(positions_nm))
-        if self._n_virtual:
-            self._context.computeVirtualSites()
+        self._context.computeVirtualSites()
 
     def set_velocities(self, velocities_nm_ps: npt.ArrayLike) -> None:
         """Set velocities `(n_atoms, 3)` nm/ps. In NVE the centre of mass is put at rest, where it then stays."""
@@ -194,14 +180,10 @@ class Engine:
     def take_over(self, state: State) -> None:
         """Take over cell, positions and velocities of another engine of this scene; the clock stays as it is."""
         if state.cell_nm is not None:
-            self.set_cell(state.cell_nm)
+            self._context.setPeriodicBoxVectors(*np.asarray(state.cell_nm, dtype=np.float64).tolist())
         self.set_positions(state.positions_nm)
         if state.velocities_nm_ps is not None:
             self.set_velocities(state.velocities_nm_ps)
-
-    def set_cell(self, cell_nm: npt.ArrayLike) -> None:
-        """Set the box vectors `(3, 3)` nm of a periodic system; before the positions."""
-        self._context.setPeriodicBoxVectors(*np.asarray(cell_nm, dtype=np.float64).tolist())
 
     def energy(self, positions_nm: npt.ArrayLike | None = None) -> float:
         """Return the potential energy in kJ/mol, here or at given positions `(n_atoms, 3)` nm."""
@@ -226,10 +208,8 @@ class Engine:
         # Without this the minimiser may search for ever.
         if not math.isfinite(self.energy()):
             raise SimulationError("the energy of the starting positions is not finite; atoms lie on top of each other")
-        try:
+        with _openmm_errors("minimisation failed"):
             openmm.LocalEnergyMinimizer.minimize(self._context, maxIterations=max_iterations)
-        except openmm.OpenMMException as error:
-            raise SimulationError(f"minimisation failed: {one_line(error)}") from error
         energy = self.energy()
         if not math.isfinite(energy):
             raise SimulationError("minimisation failed: the energy is no longer finite")
@@ -249,12 +229,8 @@ class Engine:
 
     def step(self, n_steps: int) -> None:
         """Integrate. Raises SimulationError when OpenMM itself notices that coordinates are no longer finite."""
-        import openmm
-
-        try:
+        with _openmm_errors("integration failed"):
             self._integrator.step(n_steps)
-        except openmm.OpenMMException as error:
-            raise SimulationError(f"integration failed: {one_line(error)}") from error
 
     def positions(self) -> FloatArray:
         """Return positions `(n_atoms, 3)` nm without computing any energy."""
@@ -268,16 +244,14 @@ class Engine:
         """Return positions, energies, time and kinetic temperature, and what else is asked for.
 
         With a bath, velocities are those of half steps (Zhang et al., J. Phys. Chem. A 123, 6056 (2019)), and so is the
-        temperature; without one they belong to the time of the positions.
-
-        The Langevin middle integrator leaves in its velocities half of each step's noise along the constrained bonds,
-        and projects it out after the next kick. Seen as temperature it would be n_constraints / (4 n_dof) of
-        1 - exp(-2 friction timestep) too much: 5 K of 300 at 91/ps and 2 fs. It is projected out here, which changes
-        no trajectory but in its rounding.
-
-        Raises SimulationError for a state that is not finite, or hotter than the bath can make it (`hottest_k`). A
-        model system without a bath may be as hot as it likes.
+        temperature; without one they belong to the time of the positions. Raises SimulationError for a state that is
+        not finite, or hotter than the bath can make it (`hottest_k`). A model system without a bath may be as hot as it
+        likes.
         """
+        # The Langevin middle integrator leaves in its velocities half of each step's noise along the constrained bonds,
+        # and projects it out after the next kick. Seen as temperature it would be n_constraints / (4 n_dof) of
+        # 1 - exp(-2 friction timestep) too much: 5 K of 300 at 91/ps and 2 fs. It is projected out here, which changes
+        # no trajectory but in its rounding.
         if self.n_constraints and self.ensemble != "nve":
             self._context.applyVelocityConstraints(_VELOCITY_TOLERANCE)
         raw = self._query(positions=True, energy=True, velocities=velocities, forces=forces)
@@ -288,27 +262,22 @@ class Engine:
             potential_kj_mol=float(raw.getPotentialEnergy()._value),
             kinetic_kj_mol=kinetic,
             time_ps=float(raw.getTime()._value),
-            temperature_k=2.0 * kinetic / (max(self._n_dof, 1) * GAS_CONSTANT_KJ_MOL_K),
+            temperature_k=2.0 * kinetic / (max(self.n_dof, 1) * GAS_CONSTANT_KJ_MOL_K),
             velocities_nm_ps=self._of_atoms(raw.getVelocities(asNumpy=True)) if velocities else None,
             forces_kj_mol_nm=self._of_atoms(raw.getForces(asNumpy=True)) if forces else None,
             cell_nm=np.asarray(raw.getPeriodicBoxVectors(asNumpy=True)._value) if periodic else None,
         )
         if not (np.isfinite(state.positions_nm).all() and math.isfinite(state.potential_kj_mol)):
             raise SimulationError("coordinates or energy are no longer finite")
-        if self.ensemble == "nve" and self.scene.interactions is not None:
-            return state
-        if not state.temperature_k <= hottest_k(self._temperature_k, self._n_dof):
+        is_free = self.ensemble == "nve" and self.scene.interactions is not None
+        if not (is_free or state.temperature_k <= hottest_k(self._temperature_k, self.n_dof)):
             raise SimulationError(f"the system blew up (kinetic temperature {state.temperature_k:.3g} K)")
         return state
 
     def _query(self, **what: bool) -> Any:
         """Return OpenMM's State; some platforms notice here that coordinates are no longer finite."""
-        import openmm
-
-        try:
+        with _openmm_errors("evaluation failed"):
             return self._context.getState(**what)
-        except openmm.OpenMMException as error:
-            raise SimulationError(f"evaluation failed: {one_line(error)}") from error
 
     def checkpoint(self) -> bytes:
         """Return OpenMM's binary checkpoint: positions, velocities, time, random states. Same platform only."""
@@ -316,12 +285,8 @@ class Engine:
 
     def restore(self, blob: bytes) -> None:
         """Go back to a checkpoint. Raises SimulationError when it was made by another platform or system."""
-        import openmm
-
-        try:
+        with _openmm_errors("checkpoint does not fit this run"):
             self._context.loadCheckpoint(blob)
-        except openmm.OpenMMException as error:
-            raise SimulationError(f"checkpoint does not fit this run: {one_line(error)}") from error
 
     def close(self) -> None:
         """Free the Context. The engine cannot be used afterwards."""
@@ -333,22 +298,9 @@ def integrator_name(ensemble: str) -> str:
     return "VelocityVerlet" if ensemble == "nve" else "LangevinMiddle"
 
 
-def make_integrator(
-    system: Any, ensemble: str, *, temperature_k: float, friction_per_ps: float, timestep_ps: float
-) -> Any:
-    """Return the `openmm.Integrator` of an ensemble."""
-    import openmm
-
-    if ensemble != "nve":
-        return openmm.LangevinMiddleIntegrator(temperature_k, friction_per_ps, timestep_ps)
-    return velocity_verlet(timestep_ps, constrained=system.getNumConstraints() > 0)
-
-
-def velocity_verlet(timestep_ps: float, *, constrained: bool) -> Any:
+def _velocity_verlet(timestep_ps: float, *, constrained: bool) -> Any:
     """Return velocity Verlet (Swope et al., J. Chem. Phys. 76, 637 (1982)), with RATTLE where bonds are constrained.
-
-    Unlike those of OpenMM's VerletIntegrator, a leapfrog, its velocities belong to the same time as its positions.
-    """
+    Unlike those of OpenMM's VerletIntegrator, a leapfrog, its velocities belong to the same time as its positions."""
     import openmm
 
     integrator = openmm.CustomIntegrator(timestep_ps)
@@ -366,10 +318,74 @@ def velocity_verlet(timestep_ps: float, *, constrained: bool) -> Any:
     return integrator
 
 
-def add_barostat(system: Any, *, pressure_bar: float, temperature_k: float, seed: int) -> None:
-    """Add a Monte Carlo barostat (Åqvist et al., Chem. Phys. Lett. 384, 288 (2004)) to a periodic System."""
-    import openmm
+# ---- frames whose stiff bonds are off -------------------------------------------------------------------------------
 
-    barostat = openmm.MonteCarloBarostat(pressure_bar, temperature_k, _STEPS_BETWEEN_VOLUME_MOVES)
-    barostat.setRandomNumberSeed(seed)
-    system.addForce(barostat)
+
+@dataclass(frozen=True, eq=False)
+class Relaxed:
+    """Positions `(n_atoms, 3)` nm after relaxation and their potential energy in kJ/mol, without the springs."""
+
+    positions_nm: FloatArray
+    potential_kj_mol: float
+
+
+class Relaxer:
+    """One Context with a spring on each atom. Use as a context manager or call `close`. `system`: an OpenMM System of
+    `scene` as `build_system` returns it; it is copied. Raises SimulationError when the platform cannot run it."""
+
+    def __init__(self, scene: Scene, system: Any, *, platform: str = "auto", born: bool = True) -> None:
+        import openmm
+
+        self._n_atoms, self._system = scene.n_atoms, openmm.XmlSerializer.clone(system)
+        self._springs = openmm.CustomExternalForce("0.5*k*((x-x0)^2+(y-y0)^2+(z-z0)^2)")
+        self._springs.addGlobalParameter("k", _SPRING_KJ_MOL_NM2)
+        for name in ("x0", "y0", "z0"):
+            self._springs.addPerParticleParameter(name)
+        for k in range(self._n_atoms):
+            self._springs.addParticle(k, [0.0, 0.0, 0.0])
+        self._springs.setForceGroup(_SPRINGS_GROUP)
+        self._system.addForce(self._springs)
+        self._integrator = openmm.VerletIntegrator(0.001)
+        choice = choose_platform(scene.n_atoms, platform, born=born)
+        with _openmm_errors(f"platform {choice.name} cannot run {scene.name!r}"):
+            self._context: Any = make_context(self._system, self._integrator, choice.name, choice.threads)
+
+    def relax(self, positions_nm: npt.ArrayLike) -> Relaxed:
+        """Restore constrained bonds exactly, then minimise under the springs until converged. Raises SimulationError
+        where the energy is not finite before or after, as with atoms on top of each other."""
+        import openmm
+
+        start = np.asarray(positions_nm, dtype=np.float64)
+        if not np.isfinite(start).all():
+            raise SimulationError("a frame that is not finite cannot be relaxed")
+        for k, at in enumerate(start.tolist()):
+            self._springs.setParticleParameters(k, k, at)
+        virtual = np.zeros((self._system.getNumParticles() - self._n_atoms, 3))
+        with _openmm_errors("relaxation failed"):
+            self._springs.updateParametersInContext(self._context)
+            self._context.setPositions(np.concatenate([start, virtual]))
+            self._context.computeVirtualSites()
+            if not math.isfinite(self._potential()):
+                raise SimulationError("the energy of a frame to relax is not finite; atoms lie on top of each other")
+            self._context.applyConstraints(_CONSTRAINT_TOLERANCE)
+            openmm.LocalEnergyMinimizer.minimize(self._context)
+            raw = self._context.getState(positions=True)
+        relaxed = np.asarray(raw.getPositions(asNumpy=True)._value, dtype=np.float64)[: self._n_atoms]
+        energy = self._potential()
+        if not (math.isfinite(energy) and np.isfinite(relaxed).all()):
+            raise SimulationError("relaxation failed: coordinates or energy are no longer finite")
+        return Relaxed(relaxed, energy)
+
+    def _potential(self) -> float:
+        raw = self._context.getState(energy=True, groups=~(1 << _SPRINGS_GROUP) & 0xFFFFFFFF)
+        return float(raw.getPotentialEnergy()._value)
+
+    def close(self) -> None:
+        """Free the Context. The relaxer cannot be used afterwards."""
+        self._context = None
+
+    def __enter__(self) -> Relaxer:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()

@@ -8,7 +8,6 @@ import signal
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from types import TracebackType
 from typing import Any
 
 import numpy as np
@@ -42,8 +41,8 @@ class _Pace:
 
 _CHEAP = _Pace(0.0005, None, 2.0, 0.25, 1.0)
 # Where every step is an expensive force: as few as will do. H2 has no heavy atom to make its hydrogens heavier.
-_DEAR = _Pace(0.002, 3.0, 0.3, 0.01, 0.125)
-_DEAR_LIGHT = replace(_DEAR, timestep_ps=0.0005, hydrogen_mass_da=None)
+_EXPENSIVE = _Pace(0.002, 3.0, 0.3, 0.01, 0.125)
+_EXPENSIVE_LIGHT = replace(_EXPENSIVE, timestep_ps=0.0005, hydrogen_mass_da=None)
 # Every so many-th hot state has one of its torsions turned to any angle.
 _TURN_EVERY = 3
 # Bonds of hot states are stretched, which a potential must learn; those longer than this, in radii, are broken.
@@ -85,8 +84,7 @@ class Labeller:
     def __enter__(self) -> Labeller:
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-                 ) -> None:  # fmt: skip
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     def close(self) -> None:
@@ -100,25 +98,20 @@ class Labeller:
         """Return energies and forces at states `(n, n_atoms, 3)` nm; those without an answer are left out, as are those
         of another molecule."""
         asked = np.asarray(positions_nm, dtype=np.float64)
-        stereo = changed_stereo(self.scene, asked)
-        states = [
-            state
-            for state, turned in zip(asked, stereo, strict=True)
-            if not turned and not changed_bond(self.scene, state, stretch=_BROKEN)
-        ]
+        turned = changed_stereo(self.scene, asked)
+        same = [not t and not changed_bond(self.scene, x, stretch=_BROKEN) for x, t in zip(asked, turned, strict=True)]
+        states = asked[np.array(same, dtype=bool)]
         self.n_rearranged += len(asked) - len(states)
         if self._pool is None:
             answers = [_answer(self._potential, state) for state in states]
         else:
             answers = self._pool.map(_ask, states, chunksize=4)
-        good = [(state, answer) for state, answer in zip(states, answers, strict=True) if answer is not None]
+        good = [(x, *answer) for x, answer in zip(states, answers, strict=True) if answer is not None]
         shape = (len(good), self.scene.n_atoms, 3)
+        kept, energies, forces = ([row[part] for row in good] for part in range(3))
+        n_failed, n_rearranged = len(states) - len(good), len(asked) - len(states)
         return Labels(
-            np.array([state for state, _ in good]).reshape(shape),
-            np.array([energy for _, (energy, _) in good]),
-            np.array([forces for _, (_, forces) in good]).reshape(shape),
-            len(states) - len(good),
-            len(asked) - len(states),
+            np.array(kept).reshape(shape), np.array(energies), np.array(forces).reshape(shape), n_failed, n_rearranged
         )
 
     def explore(self, n_states: int, temperatures_k: Sequence[float], *, seed: int) -> FloatArray:
@@ -126,12 +119,8 @@ class Labeller:
         water, which is rigid beside it; of every third one torsion is turned. They are near the molecule's own, and as
         many at each temperature."""
         rng = np.random.default_rng(seed)
-        each = -(-n_states // len(temperatures_k))
-        found = []
-        for temperature_k in temperatures_k:
-            seed = int(rng.integers(2**31))
-            found.append(self._md(each, self._cheap[2].apart_ps, temperature_k, seed=seed))
-        states = np.concatenate(found)
+        each, apart_ps = -(-n_states // len(temperatures_k)), self._cheap[2].apart_ps
+        states = np.concatenate([self._md(each, apart_ps, t, seed=int(rng.integers(2**31))) for t in temperatures_k])
         turn_torsions(self.scene, states, _TURN_EVERY, rng)
         order: FloatArray = states[rng.permutation(len(states))[:n_states]]
         return order
@@ -167,25 +156,24 @@ class Labeller:
     @cached_property
     def _cheap(self) -> tuple[ForceFieldSpec, Any, _Pace]:
         """The forces of hot MD, their `openmm.System`, and how it goes."""
-        elements, found = self.scene.elements, []
-        ways = [("gaff2", _CHEAP), (QUANTUM, _DEAR if set(elements) != {"H"} else _DEAR_LIGHT)]
-        if any(is_water(elements, molecule) for molecule in molecules_of(self.scene)):
-            del ways[0]
-        for name, pace in ways:
+        paces = {"gaff2": _CHEAP, QUANTUM: _EXPENSIVE if set(self.scene.elements) != {"H"} else _EXPENSIVE_LIGHT}
+        if any(is_water(self.scene.elements, molecule) for molecule in molecules_of(self.scene)):
+            del paces["gaff2"]
+        for name, pace in paces.items():
             spec = ForceFieldSpec(name, "vacuum", pace.hydrogen_mass_da, constrain_hydrogens=False)
             try:
                 return spec, build_system(self.scene, spec), pace
-            except PreparationError as error:
-                found.append(error)
-        raise found[-1]
+            except PreparationError:
+                if name == QUANTUM:
+                    raise
+        raise AssertionError("GFN2-xTB is among the ways")
 
 
 def _start(scene: dict[str, Any]) -> None:
     global _worker
     # Ctrl-C is the parent's to answer: a worker that it ends while it takes a task leaves the pool's queue locked.
-    for name in ("SIGINT", "SIGHUP"):
-        if hasattr(signal, name):
-            signal.signal(getattr(signal, name), signal.SIG_IGN)
+    for name in {"SIGINT", "SIGHUP"} & set(signal.Signals.__members__):
+        signal.signal(signal.Signals[name], signal.SIG_IGN)
     end_with_parent()
     _worker = Potential(Scene.from_dict(scene))
 

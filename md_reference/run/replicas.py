@@ -22,36 +22,18 @@ import numpy as np
 import numpy.typing as npt
 
 from md_reference.forces.forcefield import build_system
-from md_reference.run.config import SIMD, MDConfig, check_run, check_same_run, settings_of
+from md_reference.run.config import SIMD, MDConfig, check_run
 from md_reference.run.engine import Engine, refuse_damaged
-from md_reference.run.machine import available_cores
+from md_reference.run.machine import available_cores, measured_platform, simd_choice
 from md_reference.run.plan import plan_line
-from md_reference.run.platforms import measured_platform, simd_choice
-from md_reference.run.run_summary import summarise
-from md_reference.run.simulate import (
-    ProgressFn,
-    already_complete,
-    record_of,
-    simulate,
-    stand_of,
-    tell_preparing,
-)
+from md_reference.run.simulate import ProgressFn, StoredRun, already_complete, record_of, report_preparing, simulate
 from md_reference.run.starts import many_starts
 from md_reference.simd.force_field import SimdReplicas, n_replicas
 from systems.errors import InputError, SimulationError, SurromdError
 from systems.interrupts import deferred_interrupt, end_with_parent
-from systems.scene import Scene, part_of
+from systems.scene import Scene
 from systems.trajectory.base import TrajectoryWriter
-from systems.trajectory.checkpoint import (
-    Checkpoint,
-    checkpoint_path,
-    locked_outputs,
-    new_header,
-    supported_checkpoint,
-    write_checkpoint,
-    writer_at,
-)
-from systems.units import format_time_ps
+from systems.trajectory.checkpoint import Checkpoint, checkpoint_path, locked_outputs, supported_checkpoint, writer_at
 
 # Frames are computed for about so long, then written and checkpointed.
 _BLOCK_S = 2.0
@@ -103,48 +85,27 @@ def simulate_batch(
         state_path.unlink(missing_ok=True)
 
 
-class _Batch:
-    """Replicas on their way: what is done, since when, and where their checkpoint goes."""
+class _Batch(StoredRun):
+    """Replicas in the vector registers of one core."""
 
     def __init__(
         self, scene: Scene, config: MDConfig, outs: Sequence[Path], kept: Checkpoint | None, *, overwrite: bool
     ) -> None:
-        self.scene, self.config, self.outs = scene, config, outs
-        self.resumed = kept is not None
-        self.header, self.blob = kept or (new_header(len(outs), overwrite=overwrite), b"")
-        self.stand = stand_of(self.header, outs[0])
-        if kept is not None:
-            check_same_run(self.stand.config, config, outs[0])
-        self.began = time.monotonic()
-        self.done = int(self.header["files"][0]["n_frames"])
-        solute = config.kept_atoms(scene)
-        self.atoms = np.arange(scene.n_atoms) if solute is None else solute
-        self.written = scene if solute is None else part_of(scene, solute)
+        super().__init__(scene, config, outs, kept, overwrite=overwrite)
         self.system = build_system(scene, config.force)
-        self.simd = SimdReplicas(
-            self.system,
-            temperature_k=config.temperature_k,
-            friction_per_ps=config.friction_per_ps,
-            timestep_ps=config.timestep_ps,
-            seed=config.seed,
-        )
-
-    @property
-    def wall_s(self) -> float:
-        return self.stand.wall_s + time.monotonic() - self.began
+        bath: dict[str, Any] = {"temperature_k": config.temperature_k, "friction_per_ps": config.friction_per_ps}
+        self.simd = SimdReplicas(self.system, **bath, timestep_ps=config.timestep_ps, seed=config.seed)
 
     def start(
         self, starts_nm: npt.NDArray[np.floating] | None, asked_to_stop: Callable[[], bool],
         progress: ProgressFn | None,
     ) -> None:  # fmt: skip
-        """Go to where the batch was left, or to the starts, and equilibrate.
-
-        Raises SimulationError, KeyboardInterrupt.
-        """
+        """Go to where the batch was left, or to the starts, and equilibrate. Raises SimulationError,
+        KeyboardInterrupt."""
         if self.resumed:
             self.simd.restore(self.blob)
             return
-        tell_preparing(progress, 0.0)
+        report_preparing(progress, 0.0)
         if starts_nm is None:
             # The Reference platform has no neighbour lists.
             platform = "Reference" if self.scene.cell_nm is None else "CPU"
@@ -153,7 +114,7 @@ class _Batch:
                 starts_nm = engine.positions()[None]
                 refuse_damaged(self.scene, starts_nm[0])
         self.simd.check(self.system, starts_nm[0])
-        # SimdReplicas left over repeat the last start; they cost nothing and are not kept.
+        # Replicas left over repeat the last start; they cost nothing and are not kept.
         self.simd.set_positions(starts_nm[np.minimum(np.arange(self.simd.n_replicas), len(starts_nm) - 1)])
         self.simd.thermalise()
         n_steps = math.ceil(round(self.config.equilibrate_ps / self.config.timestep_ps, 6))
@@ -162,13 +123,11 @@ class _Batch:
             if asked_to_stop():
                 raise KeyboardInterrupt
             self.simd.step(min(piece, n_steps - done))
-            tell_preparing(progress, min(1.0, (done + piece) / n_steps))
+            report_preparing(progress, min(1.0, (done + piece) / n_steps))
         self.save()
 
     def save(self) -> None:
-        said = {"config": settings_of(self.config), "wall_s": self.wall_s, "platform": SIMD}
-        self.header = {**{key: self.header[key] for key in ("run_id", "overwrite", "files")}, **said}
-        write_checkpoint(checkpoint_path(self.outs[0]), self.header, self.simd.checkpoint())
+        self.keep(self.simd.checkpoint(), platform=SIMD)
 
     def produce(
         self, writers: Sequence[TrajectoryWriter], asked_to_stop: Callable[[], bool], progress: ProgressFn | None
@@ -185,36 +144,16 @@ class _Batch:
                 for k, writer in enumerate(writers):
                     scalars = {"potential_kj_mol": energies[k], "temperature_k": temperatures[k]}
                     writer.append(positions[k], times, scalars=scalars, cell_nm=cells)
-                self.done += len(frames)
-                self.header["files"] = [{"n_frames": self.done, "digest": w.digest()} for w in writers]
-            if failure:
-                for writer in writers:
-                    writer.update_record({"completed": False, "failure": failure, "cost": self.cost()})
-                raise SimulationError(
-                    f"{self.scene.name}: {failure} after {format_time_ps(self.done * config.save_every_ps)}; "
-                    f"{self.done} good frames are in {self.outs[0]} and each other file of this batch."
-                )
+                self.written_so_far(writers, len(frames))
+            where = f"{self.outs[0]} and each other file of this batch."
+            self.refuse_failed(failure, writers, where)
             if self.done < config.n_frames:
                 self.save()
             if progress is not None:
                 progress(n * self.done, n * config.n_frames)
             if asked_to_stop() and self.done < config.n_frames:
-                for writer in writers:
-                    writer.update_record({"cost": self.cost()})
-                raise KeyboardInterrupt
-        for writer in writers:
-            time_ps, scalars = writer.series()
-            summary = summarise(
-                time_ps,
-                scalars,
-                mass_da=float(self.scene.masses_da.sum()),
-                ensemble=config.ensemble,
-                temperature_k=config.temperature_k,
-                n_dof=self.simd.n_dof,
-            )
-            writer.update_record(
-                {"completed": True, "time_ps": config.time_ps, "cost": self.cost(), "summary": summary}
-            )
+                self.stop(writers)
+        self.finish(writers, self.simd.n_dof)
 
     def _frames(self, asked_to_stop: Callable[[], bool]) -> tuple[list[tuple[Any, Any, Any]], str]:
         """Return the frames of the next seconds, each positions, energies and temperatures of all replicas."""
@@ -230,16 +169,6 @@ class _Batch:
             positions = self.simd.positions_nm[:, self.atoms].astype(np.float32)
             found.append((positions, self.simd.energies(), self.simd.temperatures_k()))
         return found, ""
-
-    def cost(self) -> dict[str, float]:
-        """Return each replica's share of the cost; a core runs all of them at once."""
-        simulated_ps = self.done * self.config.save_every_ps
-        wall_s = self.wall_s / len(self.outs)
-        return {
-            "wall_s": wall_s,
-            "energy_evaluations": self.done * self.config.steps_per_frame,
-            "ns_per_day": simulated_ps * 1e-3 / wall_s * 86400.0,
-        }
 
 
 # ---- processes ------------------------------------------------------------------------------------------------------
@@ -286,32 +215,33 @@ def simulate_replicas(
     scene = scene if isinstance(scene, Scene) else scene[0]
     for out in outs:
         config = check_run(scene, config, out)
-    configs = [replace(config, seed=config.seed + k) for k in range(len(outs))]
-    jobs = [[k] for k in range(len(outs))]
-    if config.platform == SIMD:
-        size = n_replicas()
-        jobs = [list(range(k, min(k + size, len(outs)))) for k in range(0, len(outs), size)]
+    size = n_replicas() if config.platform == SIMD else 1
+    jobs = [range(k, min(k + size, len(outs))) for k in range(0, len(outs), size)]
     width = workers or min(len(jobs), available_cores())
     # What goes on keeps its platform.
     fresh = [out for out in outs if not (resume and (out.exists() or checkpoint_path(out).exists()))]
     choice = None
-    if fresh and config.platform == SIMD:
+    if fresh:
+        if config.platform != SIMD:
+            each = max(1, available_cores() // width)
+            choice = measured_platform(scene, config, max_threads=each, side_by_side=width)
         if announce is not None:
-            announce(plan_line(scene, config, simd_choice(), replicas=len(outs)))
-    elif fresh:
-        choice = measured_platform(scene, config, max_threads=max(1, available_cores() // width), side_by_side=width)
-        if announce is not None:
-            announce(plan_line(scene, config, choice, replicas=len(outs)))
+            announce(plan_line(scene, config, choice or simd_choice(), replicas=len(outs)))
     scenes = [scene] * len(outs) if given is None else given
     if fresh and given is None and config.starts == "many" and len(outs) > 1:
-        tell_preparing(progress, 0.0)
+        report_preparing(progress, 0.0)
         starts = many_starts(scene, config, len(outs))
         scenes = list(starts.scenes)
         if announce is not None:
             announce(starts.how)
     how: dict[str, Any] = {"resume": resume, "overwrite": overwrite, "choice": choice}
+
+    def job(k: int) -> tuple[list[Scene], MDConfig, list[Path], dict[str, Any]]:
+        own = replace(config, seed=config.seed + jobs[k][0])
+        return [scenes[i] for i in jobs[k]], own, [outs[i] for i in jobs[k]], how
+
     if len(jobs) == 1:
-        _run([scenes[k] for k in jobs[0]], [configs[k] for k in jobs[0]], list(outs), how, progress)
+        _run(*job(0), progress)
         return list(outs)
     context = multiprocessing.get_context("spawn")
     # Without a lock, which a killed process would never give back: each number has one writer.
@@ -326,10 +256,7 @@ def simulate_replicas(
             while waiting or running:
                 while waiting and len(running) < width:
                     k = waiting.pop(0)
-                    of_job = [configs[i] for i in jobs[k]], [outs[i] for i in jobs[k]]
-                    once = {id(scenes[i]): scenes[i].to_dict() for i in jobs[k]}
-                    args = ([once[id(scenes[i])] for i in jobs[k]], *of_job, how, board, k)
-                    process = context.Process(target=_replicas, args=args, name=f"replica-{jobs[k][0]}")
+                    process = context.Process(target=_replicas, args=(*job(k), board, k), name=f"replica-{jobs[k][0]}")
                     process.start()
                     running[k] = process
                 time.sleep(0.1)
@@ -337,7 +264,7 @@ def simulate_replicas(
                     raise KeyboardInterrupt
                 n_done = int(sum(board.done[:]))
                 if n_done == 0:
-                    tell_preparing(progress, sum(board.equilibrated[:]) / len(jobs))
+                    report_preparing(progress, sum(board.equilibrated[:]) / len(jobs))
                 elif progress is not None:
                     progress(n_done, config.n_frames * len(outs))
                 for k in [k for k, process in running.items() if not process.is_alive()]:
@@ -363,7 +290,7 @@ def simulate_replicas(
     return list(outs)
 
 
-def _error(failures: dict[int, str], jobs: list[list[int]]) -> SimulationError:
+def _error(failures: dict[int, str], jobs: Sequence[range]) -> SimulationError:
     k = min(failures)
     failed, of_all = sum(len(jobs[i]) for i in failures), sum(map(len, jobs))
     return SimulationError(f"{failed} of {of_all} replicas failed; replica {jobs[k][0]}: {failures[k]}")
@@ -380,25 +307,19 @@ def _collect(errors: Any, reasons: dict[int, str], wanted: int) -> None:
 
 
 def _run(
-    scenes: Sequence[Scene], configs: Sequence[MDConfig], outs: Sequence[Path], how: dict[str, Any],
-    progress: ProgressFn | None,
-) -> None:  # fmt: skip
+    scenes: Sequence[Scene], config: MDConfig, outs: Sequence[Path], how: dict[str, Any], progress: ProgressFn | None
+) -> None:
     """Run one replica, or on platform simd a batch of them; `how`: what else `simulate` takes."""
-    if configs[0].platform == SIMD:
+    if config.platform == SIMD:
         starts = None if all(s is scenes[0] for s in scenes[1:]) else np.stack([s.positions_nm for s in scenes])
         of_files = {"resume": how["resume"], "overwrite": how["overwrite"], "progress": progress}
-        simulate_batch(scenes[0], configs[0], outs, starts_nm=starts, **of_files)
+        simulate_batch(scenes[0], config, outs, starts_nm=starts, **of_files)
     else:
-        simulate(scenes[0], configs[0], outs[0], progress=progress, **how)
+        simulate(scenes[0], config, outs[0], progress=progress, **how)
 
 
 def _replicas(
-    scenes: Sequence[dict[str, Any]],
-    configs: Sequence[MDConfig],
-    outs: Sequence[Path],
-    how: dict[str, Any],
-    board: _Board,
-    k: int,
+    scenes: Sequence[Scene], config: MDConfig, outs: Sequence[Path], how: dict[str, Any], board: _Board, k: int
 ) -> None:
     """Run the k-th job in a process of its own."""
     end_with_parent()
@@ -411,8 +332,7 @@ def _replicas(
             board.equilibrated[k] = done / total
 
     try:
-        made = {id(s): Scene.from_dict(s) for s in scenes}  # those that are one stay one
-        _run([made[id(s)] for s in scenes], configs, outs, how, report)
+        _run(scenes, config, outs, how, report)
     except SurromdError as error:
         board.errors.put((k, str(error)))
         raise SystemExit(1) from None

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from systems.scene import FloatArray
 from systems.units import GAS_CONSTANT_KJ_MOL_K
 
 _G_ML_PER_DA_NM3 = 1.66053906660e-3
@@ -41,10 +42,8 @@ def mean_and_error(values: npt.ArrayLike) -> dict[str, float | None]:
 
 
 def drift(time_ps: npt.ArrayLike, energy_kj_mol: npt.ArrayLike, n_dof: int) -> dict[str, float | None]:
-    """Return the slope of the total energy by least squares, kJ/mol per ns and degree of freedom, and its error.
-
-    The residuals are correlated: their statistical inefficiency widens the error of the slope.
-    """
+    """Return the slope of the total energy by least squares, kJ/mol per ns and degree of freedom, and its error. The
+    residuals are correlated: their statistical inefficiency widens the error of the slope."""
     t = np.asarray(time_ps, dtype=np.float64) * 1e-3
     energy = np.asarray(energy_kj_mol, dtype=np.float64) / max(n_dof, 1)
     if len(t) < 3:
@@ -58,14 +57,9 @@ def drift(time_ps: npt.ArrayLike, energy_kj_mol: npt.ArrayLike, n_dof: int) -> d
 
 
 def summarise(
-    time_ps: npt.ArrayLike,
-    scalars: dict[str, npt.NDArray[np.float64]],
-    *,
-    mass_da: float,
-    ensemble: str,
-    temperature_k: float,
+    time_ps: npt.ArrayLike, scalars: dict[str, FloatArray], *, mass_da: float, ensemble: str, temperature_k: float,
     n_dof: int,
-) -> dict[str, Any]:
+) -> dict[str, Any]:  # fmt: skip
     """Return the summary of a run's frames, JSON-able: temperature and potential; drift in NVE; volume and density.
 
     Frames without a value (written by an older version) are left out. `target` is the bath's temperature, None without.
@@ -76,7 +70,8 @@ def summarise(
     out: dict[str, Any] = {
         "n_frames": len(np.asarray(time_ps)),
         "degrees_of_freedom": n_dof,
-        "temperature_k": {**mean_and_error(known["temperature_k"]), "target": _target(ensemble, temperature_k)},
+        "temperature_k": mean_and_error(known["temperature_k"])
+        | {"target": None if ensemble == "nve" else temperature_k},
         "potential_kj_mol": mean_and_error(known["potential_kj_mol"]),
     }
     if ensemble == "nve":
@@ -85,14 +80,9 @@ def summarise(
         out["total_kj_mol"] = {"mean": float(total.mean()), "standard_deviation": float(total.std())}
         out["drift"] = drift(time_ps, total, n_dof)
     if len(known.get("volume_nm3", ())):
-        volume = mean_and_error(known["volume_nm3"])
-        out["volume_nm3"] = volume
+        out["volume_nm3"] = mean_and_error(known["volume_nm3"])
         out["density_g_ml"] = mean_and_error(mass_da * _G_ML_PER_DA_NM3 / known["volume_nm3"])
     return out
-
-
-def _target(ensemble: str, temperature_k: float) -> float | None:
-    return None if ensemble == "nve" else temperature_k
 
 
 def summary_lines(summary: dict[str, Any]) -> list[str]:
@@ -111,26 +101,18 @@ def summary_lines(summary: dict[str, Any]) -> list[str]:
         shown = {"mean": slope["kj_mol_ns_dof"], "standard_error": slope["standard_error"]}
         parts.append(f"total energy drifts by {_with_error(shown, 'kJ/mol/ns per degree of freedom')}")
     lines = [", ".join(parts)]
-    off = _off_target(temperature)
-    if off:
-        lines.append(f"warning: the mean temperature is {off:+.1f} K off the bath's; try a shorter `timestep_ps`.")
-    return lines
-
-
-def _off_target(temperature: dict[str, Any]) -> float:
-    """Return how far the mean is from the bath in K where neither chance nor a usual time step explains it, else 0."""
     target, error = temperature.get("target"), temperature.get("standard_error")
-    if target is None or error is None:
-        return 0.0
-    off = float(temperature["mean"] - target)
-    return off if abs(off) > _STANDARD_ERRORS * error + _BIAS * target else 0.0
+    if target is not None and error is not None:
+        # Where neither chance nor a usual time step explains it.
+        off = float(temperature["mean"] - target)
+        if abs(off) > _STANDARD_ERRORS * error + _BIAS * target:
+            lines.append(f"warning: the mean temperature is {off:+.1f} K off the bath's; try a shorter `timestep_ps`.")
+    return lines
 
 
 def _with_error(value: dict[str, Any], unit: str) -> str:
     error = value.get("standard_error")
-    if error is None:
-        return f"{value['mean']:.4g} {unit}"
-    if error <= 0 or not math.isfinite(error):
-        return f"{value['mean']:.6g} {unit}"
+    if error is None or error <= 0 or not math.isfinite(error):
+        return f"{value['mean']:.{4 if error is None else 6}g} {unit}"
     digits = max(0, 1 - math.floor(math.log10(error)))
     return f"{value['mean']:.{digits}f} ± {error:.{digits}f} {unit}"

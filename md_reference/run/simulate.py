@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -15,7 +15,7 @@ import numpy as np
 from md_reference.forces.forcefield import build_system
 from md_reference.run.config import MDConfig, check_run, check_same_run, settings_of
 from md_reference.run.engine import Engine, State, integrator_name, refuse_damaged
-from md_reference.run.platforms import PlatformChoice, measured_platform
+from md_reference.run.machine import PlatformChoice, measured_platform
 from md_reference.run.run_summary import summarise
 from systems.errors import InputError, SimulationError
 from systems.files.schema import built
@@ -45,8 +45,8 @@ class ProgressFn(Protocol):
     def __call__(self, done: int, total: int, note: str | None = None) -> None: ...
 
 
-def tell_preparing(progress: ProgressFn | None, share: float) -> None:
-    """Tell which share of the equilibration is done; 0 while minimising."""
+def report_preparing(progress: ProgressFn | None, share: float) -> None:
+    """Report which share of the equilibration is done; 0 while minimising."""
     if progress is not None:
         progress(round(1000 * share), 1000, "equilibrating" if share else "minimising")
 
@@ -84,17 +84,13 @@ def simulate(
     out = Path(out)
     config = check_run(scene, config, out)
     chk = checkpoint_path(out)
-    with (
-        deferred_interrupt() as asked_to_stop,
-        locked_outputs([out], may_exist=resume or overwrite),
-    ):
+    with deferred_interrupt() as asked_to_stop, locked_outputs([out], may_exist=resume or overwrite):
         if resume and out.exists() and not chk.exists():
             already_complete(out, config)
             return out
         kept = supported_checkpoint(chk, [out]) if resume and chk.exists() else None
-        run = _Run(scene, config, out, checkpoint_every_s, kept, overwrite=overwrite)
-        run.asked_to_stop = asked_to_stop
-        run.progress = progress
+        run = _Run(scene, config, out, kept, overwrite=overwrite)
+        run.asked_to_stop, run.progress, run.checkpoint_every_s = asked_to_stop, progress, checkpoint_every_s
         run.prepare(choice)
         with run.engine_at_start() as engine, run.writer() as writer:
             run.produce(engine, writer)
@@ -114,46 +110,93 @@ class Stand:
     equilibrated_steps: Annotated[int, range(2**63)] | None = None
 
 
-def stand_of(header: dict[str, Any], out: Path) -> Stand:
-    """Return where the header of a checkpoint says that a run stands. Raises InputError."""
-    own = {key: header[key] for key in header.keys() & Stand.__annotations__.keys()}
-    try:
-        return built(Stand, own)
-    except ValueError as error:
-        raise InputError(f"checkpoint {checkpoint_path(out)} cannot be gone on from ({error}).") from error
-
-
-class _Run:
-    """One run on its way: what is done, since when, and where its checkpoint goes."""
+class StoredRun:
+    """Replicas on their way (one, or a batch with one checkpoint): what is done, since when, what their files say.
+    Raises InputError for a checkpoint that is not of this run."""
 
     def __init__(
-        self,
-        scene: Scene,
-        config: MDConfig,
-        out: Path,
-        checkpoint_every_s: float,
-        kept: Checkpoint | None,
-        *,
-        overwrite: bool,
+        self, scene: Scene, config: MDConfig, outs: Sequence[Path], kept: Checkpoint | None, *, overwrite: bool
     ) -> None:
-        self.scene, self.config, self.out = scene, config, out
-        self.checkpoint_every_s, self.resumed = checkpoint_every_s, kept is not None
-        self.header, self.blob = kept or (new_header(1, overwrite=overwrite), b"")
-        self.stand = stand_of(self.header, out)
-        if kept is not None:
-            check_same_run(self.stand.config, config, out)
-        self.asked_to_stop: Callable[[], bool] = lambda: False
-        self.progress: ProgressFn | None = None
+        self.scene, self.config, self.outs = scene, config, outs
+        self.resumed = kept is not None
+        self.header, self.blob = kept or (new_header(len(outs), overwrite=overwrite), b"")
+        try:
+            self.stand = built(Stand, {k: v for k, v in self.header.items() if k in Stand.__annotations__})
+        except ValueError as error:
+            raise InputError(f"checkpoint {checkpoint_path(outs[0])} cannot be gone on from ({error}).") from error
+        if self.resumed:
+            check_same_run(self.stand.config, config, outs[0])
+        self.began = time.monotonic()
         self.done = int(self.header["files"][0]["n_frames"])
-        self.steps_into_frame = self.stand.steps_into_frame
-        self.started = self.saved_at = time.monotonic()
-        self.piece = 10
-        self.system: Any = None
-        self.kept = config.kept_atoms(scene)
+        solute = config.kept_atoms(scene)
+        self.atoms = np.arange(scene.n_atoms) if solute is None else solute
+        self.written = scene if solute is None else part_of(scene, solute)
 
     @property
     def wall_s(self) -> float:
-        return self.stand.wall_s + time.monotonic() - self.started
+        return self.stand.wall_s + time.monotonic() - self.began
+
+    def cost(self) -> dict[str, float]:
+        """Return each replica's share of the cost of what is in the files; equilibration is in the wall time and not in
+        the count of production steps."""
+        simulated_ps, wall_s = self.done * self.config.save_every_ps, self.wall_s / len(self.outs)
+        return {
+            "wall_s": wall_s,
+            "energy_evaluations": self.done * self.config.steps_per_frame,
+            "ns_per_day": simulated_ps * 1e-3 / wall_s * 86400.0,
+        }
+
+    def keep(self, blob: bytes, **said: Any) -> None:
+        """Write the checkpoint: the state `blob` of what runs, and what is said of it."""
+        said |= {"config": settings_of(self.config), "wall_s": self.wall_s}
+        self.header = {key: self.header[key] for key in ("run_id", "overwrite", "files")} | said
+        write_checkpoint(checkpoint_path(self.outs[0]), self.header, blob)
+
+    def written_so_far(self, writers: Sequence[TrajectoryWriter], n_new: int) -> None:
+        """Count frames that were appended to each file."""
+        self.done += n_new
+        self.header["files"] = [{"n_frames": self.done, "digest": writer.digest()} for writer in writers]
+
+    def refuse_failed(self, failure: str, writers: Sequence[TrajectoryWriter], where: str) -> None:
+        """Raise SimulationError, and say in the files why they hold no more frames, where a run has failed."""
+        if not failure:
+            return
+        for writer in writers:
+            writer.update_record({"completed": False, "failure": failure, "cost": self.cost()})
+        raise SimulationError(
+            f"{self.scene.name}: {failure} after {format_time_ps(self.done * self.config.save_every_ps)}; "
+            f"{self.done} good frames are in {where}"
+        )
+
+    def stop(self, writers: Sequence[TrajectoryWriter]) -> None:
+        """Raise KeyboardInterrupt, the cost so far in the files."""
+        for writer in writers:
+            writer.update_record({"cost": self.cost()})
+        raise KeyboardInterrupt
+
+    def finish(self, writers: Sequence[TrajectoryWriter], n_dof: int) -> None:
+        """Say in the files that they are complete, what they cost, and how the run went."""
+        config, mass_da = self.config, float(self.scene.masses_da.sum())
+        bath: dict[str, Any] = {"ensemble": config.ensemble, "temperature_k": config.temperature_k}
+        for writer in writers:
+            time_ps, scalars = writer.series()
+            summary = summarise(time_ps, scalars, mass_da=mass_da, n_dof=n_dof, **bath)
+            # A resumed run may have become longer than the one that wrote the record.
+            length = {"completed": True, "time_ps": config.time_ps}
+            writer.update_record({**length, "cost": self.cost(), "summary": summary})
+
+
+class _Run(StoredRun):
+    """One replica by OpenMM."""
+
+    asked_to_stop: Callable[[], bool] = staticmethod(lambda: False)
+    progress: ProgressFn | None = None
+    checkpoint_every_s = 20.0
+
+    def __init__(self, scene: Scene, config: MDConfig, out: Path, kept: Checkpoint | None, *, overwrite: bool) -> None:
+        super().__init__(scene, config, [out], kept, overwrite=overwrite)
+        self.steps_into_frame, self.saved_at, self.piece = self.stand.steps_into_frame, self.began, 10
+        self.system: Any = None
 
     def prepare(self, choice: PlatformChoice | None) -> None:
         """Build the forces and settle the platform."""
@@ -180,10 +223,9 @@ class _Run:
 
     def writer(self) -> TrajectoryWriter:
         """Return the writer of the trajectory, which holds the frames that are done."""
-        columns = self.config.columns
         record = record_of(self.scene, self.config, self.choice)
-        scene = self.scene if self.kept is None else part_of(self.scene, self.kept)
-        return writer_at(self.out, scene, record, self.header, resumed=self.resumed, columns=columns)
+        columns = self.config.columns
+        return writer_at(self.outs[0], self.written, record, self.header, resumed=self.resumed, columns=columns)
 
     def _equilibrated(self) -> Engine:
         """Return the engine at time 0: minimised, and run for `equilibrate_ps` in the bath."""
@@ -205,7 +247,7 @@ class _Run:
     def _equilibrate(self, engine: Engine) -> None:
         n_steps = math.ceil(round(self.config.equilibrate_ps / self.config.timestep_ps, 6))
         done = self.stand.equilibrated_steps or 0
-        tell_preparing(self.progress, done / max(n_steps, 1))
+        report_preparing(self.progress, done / max(n_steps, 1))
         if self.blob:
             engine.restore(self.blob)
         else:
@@ -214,7 +256,7 @@ class _Run:
             engine.thermalise()
         while done < n_steps:
             done += self._advance(engine, n_steps - done)
-            tell_preparing(self.progress, done / n_steps)
+            report_preparing(self.progress, done / n_steps)
             stop = self.asked_to_stop()
             if stop or time.monotonic() - self.saved_at > self.checkpoint_every_s:
                 self.save(engine, equilibrated_steps=done)
@@ -233,14 +275,7 @@ class _Run:
 
     def save(self, engine: Engine, **more: Any) -> None:
         """Write the checkpoint."""
-        said = {
-            "config": settings_of(self.config),
-            "wall_s": self.wall_s,
-            "platform": engine.platform_name,
-            "threads": engine.threads,
-        }
-        self.header = {**{key: self.header[key] for key in ("run_id", "overwrite", "files")}, **said, **more}
-        write_checkpoint(checkpoint_path(self.out), self.header, engine.checkpoint())
+        self.keep(engine.checkpoint(), platform=engine.platform_name, threads=engine.threads, **more)
         self.saved_at = time.monotonic()
 
     def produce(self, engine: Engine, writer: TrajectoryWriter) -> None:
@@ -253,14 +288,8 @@ class _Run:
             states, failure = self._frames(engine, size)
             computed = time.monotonic()
             self._write(writer, states)
-            self.done += len(states)
-            self.header["files"] = [{"n_frames": self.done, "digest": writer.digest()}]
-            if failure:
-                writer.update_record({"completed": False, "failure": failure, "cost": self.cost()})
-                raise SimulationError(
-                    f"{self.scene.name}: {failure} after {format_time_ps(self.done * config.save_every_ps)}; "
-                    f"{self.done} good frames are in {self.out}. {_advice(config)}"
-                )
+            self.written_so_far([writer], len(states))
+            self.refuse_failed(failure, [writer], f"{self.outs[0]}. {_advice(config)}")
             stop = self.asked_to_stop() and self.done < n_frames
             if self.done < n_frames:
                 self.save(engine, steps_into_frame=self.steps_into_frame)
@@ -268,21 +297,10 @@ class _Run:
             if self.progress is not None:
                 self.progress(self.done, n_frames)
             if stop:
-                writer.update_record({"cost": self.cost()})
-                raise KeyboardInterrupt
+                self.stop([writer])
             per_frame_s = max((computed - began) / max(len(states), 1), 1e-6)
             block = min(max(1, round(max(_BLOCK_S, FLUSH_SHARE * flushed_s) / per_frame_s)), 1000, 2 * block)
-        time_ps, scalars = writer.series()
-        summary = summarise(
-            time_ps,
-            scalars,
-            mass_da=float(self.scene.masses_da.sum()),
-            ensemble=config.ensemble,
-            temperature_k=config.temperature_k,
-            n_dof=engine.n_dof,
-        )
-        # A resumed run may have become longer than the one that wrote the record.
-        writer.update_record({"completed": True, "time_ps": config.time_ps, "cost": self.cost(), "summary": summary})
+        self.finish([writer], engine.n_dof)
 
     def _frames(self, engine: Engine, n: int) -> tuple[list[State], str]:
         """Return up to `n` frames, fewer when somebody asked to stop or the run failed, and why it failed."""
@@ -305,17 +323,13 @@ class _Run:
     def _write(self, writer: TrajectoryWriter, states: list[State]) -> None:
         if not states:
             return
-        config, periodic = self.config, self.scene.cell_nm is not None
-        atoms = slice(None) if self.kept is None else self.kept
+        config = self.config
 
         def written(name: str) -> FloatArray:
-            return np.array([getattr(s, name)[atoms] for s in states])
+            return np.array([getattr(s, name)[self.atoms] for s in states])
 
-        scalars = {
-            "potential_kj_mol": np.array([s.potential_kj_mol for s in states]),
-            "temperature_k": np.array([s.temperature_k for s in states]),
-        }
-        cells = np.array([s.cell_nm for s in states]) if periodic else None
+        scalars = {name: np.array([getattr(s, name) for s in states]) for name in ("potential_kj_mol", "temperature_k")}
+        cells = None if self.scene.cell_nm is None else np.array([s.cell_nm for s in states])
         if cells is not None and config.ensemble == "npt":
             scalars["volume_nm3"] = np.linalg.det(cells)
         writer.append(
@@ -326,15 +340,6 @@ class _Run:
             forces_kj_mol_nm=written("forces_kj_mol_nm") if config.save_forces else None,
             cell_nm=cells,
         )
-
-    def cost(self) -> dict[str, float]:
-        """Cost of what is in the file; equilibration is in the wall time and not in the count of production steps."""
-        simulated_ps = self.done * self.config.save_every_ps
-        return {
-            "wall_s": self.wall_s,
-            "energy_evaluations": self.done * self.config.steps_per_frame,
-            "ns_per_day": simulated_ps * 1e-3 / self.wall_s * 86400.0,
-        }
 
 
 def record_of(scene: Scene, config: MDConfig, choice: PlatformChoice) -> dict[str, Any]:

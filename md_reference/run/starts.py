@@ -17,8 +17,7 @@ from md_reference.forces.forcefield import build_system
 from md_reference.forces.mixture import solute_of
 from md_reference.forces.spec import QUANTUM, ForceFieldSpec
 from md_reference.run.config import Conditions
-from md_reference.run.engine import Engine
-from md_reference.run.frame_relaxation import Relaxer
+from md_reference.run.engine import Engine, Relaxer
 from md_reference.simd.force_field import SimdReplicas, n_replicas
 from md_reference.simd.system_terms import SimdUnavailableError
 from systems.chemistry.geometry import torsion

@@ -43,74 +43,58 @@ def _structure(name: str, *fields: tuple[str, Any]) -> type[ctypes.Structure]:
     return type(name, (ctypes.Structure,), {"_fields_": list(fields)})
 
 
-def _all(kind: Any, *names: str) -> list[tuple[str, Any]]:
-    return [(name, kind) for name in names]
+def _all(kind: Any, names: str) -> list[tuple[str, Any]]:
+    return [(name, kind) for name in names.split()]
 
 
 _INT, _FLOAT, _POINTER = ctypes.c_int32, ctypes.c_float, ctypes.c_void_p
 _Bath = _structure(
     "_Bath",
-    *_all(_INT, "n_atoms", "n_bonds"),
-    *_all(_POINTER, "atoms", "bonds", "lengths"),
-    *_all(_FLOAT, "timestep", "keep", "noise", "tolerance"),
+    *_all(_INT, "n_atoms n_bonds"),
+    *_all(_POINTER, "atoms bonds lengths"),
+    *_all(_FLOAT, "timestep keep noise tolerance"),
 )
 _RigidWaters = _structure(
     "_RigidWaters", ("n", _INT), ("masses", _FLOAT * 3), ("legs", _FLOAT * 2), ("inverse", _FLOAT * 9)
 )
 _Molecule = _structure(
     "_Molecule",
-    *_all(_INT, "n_atoms", "n_bonds", "n_angles", "n_torsions", "n_biased", "born"),
-    *_all(
-        _POINTER,
-        "bonds",
-        "bond_terms",
-        "angles",
-        "angle_terms",
-        "torsions",
-        "torsion_terms",
-        "biases",
-        "pairs",
-        "radii",
-    ),
+    *_all(_INT, "n_atoms n_bonds n_angles n_torsions n_biased born"),
+    *_all(_POINTER, "bonds bond_terms angles angle_terms torsions torsion_terms biases pairs radii"),
     ("surface", _FLOAT),
     ("work", _POINTER),
 )
 _Water = _structure(
     "_Water",
-    *_all(_INT, "n_solute", "n_waters", "n_excluded", "n_pairs"),
+    *_all(_INT, "n_solute n_waters n_excluded n_pairs"),
     ("cell", _FLOAT * 6),
     ("inverse", _FLOAT * 3),
-    *_all(_FLOAT, "cutoff2", "list2"),
+    *_all(_FLOAT, "cutoff2 list2"),
     ("force", _POINTER),
     ("piece", _FLOAT),
     ("energy", _FLOAT * (ENERGY_DEGREE + 1)),
     ("own", _FLOAT * 4),
     ("lennard_jones", _FLOAT * 2),
     ("inside", _FLOAT * 2),
-    *_all(_POINTER, "solute", "pairs", "pair_terms", "excluded", "excluded_terms"),
-    *_all(_INT, "n_units", "ewald"),
-    *_all(_POINTER, "middles", "partners", "begins", "sites", "near"),
+    *_all(_POINTER, "solute pairs pair_terms excluded excluded_terms"),
+    *_all(_INT, "n_units ewald"),
+    *_all(_POINTER, "middles partners begins sites near"),
     ("n_near", _INT),
-    *_all(_POINTER, "names", "images"),
+    *_all(_POINTER, "names images"),
 )
 _Transform = _structure("_Transform", ("n", _INT), ("n_factors", _INT), ("factors", _INT * 8), ("turns", _FLOAT * 256))
 _Mesh = _structure(
     "_Mesh",
-    *_all(_INT, "n_atoms", "nx", "ny", "nz"),
-    *_all(_POINTER, "order", "charges", "influence"),
+    *_all(_INT, "n_atoms nx ny nz"),
+    *_all(_POINTER, "order charges influence"),
     ("to_cell", _FLOAT * 9),
     ("along", _Transform * 3),
-    *_all(_POINTER, "own", "modes", "fractions", "felt", "cells"),
+    *_all(_POINTER, "own modes fractions felt cells"),
 )
 _System = _structure(
     "_System",
-    ("bath", _Bath),
-    ("rigid", _RigidWaters),
-    ("molecule", _Molecule),
-    ("water", _Water),
-    ("mesh", _Mesh),
-    ("periodic", _INT),
-    ("listed_steps", _INT),
+    *[("bath", _Bath), ("rigid", _RigidWaters), ("molecule", _Molecule), ("water", _Water), ("mesh", _Mesh)],
+    *_all(_INT, "periodic listed_steps"),
     ("constant", ctypes.c_double),
 )
 
@@ -133,10 +117,8 @@ def _program(width: int | None = None) -> ctypes.CDLL:
 
 
 def n_replicas() -> int:
-    """How many replicas a batch has: 16, 8 or 4, what a register of this processor holds.
-
-    Raises SimdUnavailableError.
-    """
+    """How many replicas a batch has: 16, 8 or 4, what a register of this processor holds. Raises
+    SimdUnavailableError."""
     return int(_program().replicas())
 
 
@@ -186,17 +168,10 @@ class SimdReplicas:
         self._kept: list[Any] = []
         self._system = _System()
         self._fill(
-            self._system.bath,
-            n_atoms=terms.n_solute,
-            n_bonds=len(terms.rigid),
-            atoms=np.stack([1.0 / masses, speeds], axis=1),
-            bonds=terms.rigid,
-            lengths=terms.lengths,
-            timestep=timestep_ps,
-            keep=keep,
-            noise=math.sqrt(1.0 - keep * keep),
-            tolerance=_TOLERANCE,
-        )
+            self._system.bath, n_atoms=terms.n_solute, n_bonds=len(terms.rigid), bonds=terms.rigid,
+            atoms=np.stack([1.0 / masses, speeds], axis=1), lengths=terms.lengths,
+            timestep=timestep_ps, keep=keep, noise=math.sqrt(1.0 - keep * keep), tolerance=_TOLERANCE,
+        )  # fmt: skip
         self._fill(self._system.rigid, n=terms.n_waters, **terms.rigid_water)
         self._biases = aligned((len(biased), 2, self.n_replicas))
         self._fill(
@@ -223,12 +198,8 @@ class SimdReplicas:
         kinds = dict(target._fields_)
         for name, value in values.items():
             if kinds[name] is _POINTER:
-                array = value
-                if array.dtype not in (np.float32, np.int32):
-                    array = np.ascontiguousarray(
-                        array, np.int32 if np.issubdtype(array.dtype, np.integer) else np.float32
-                    )
-                array = np.ascontiguousarray(array)
+                kind = np.int32 if np.issubdtype(value.dtype, np.integer) else np.float32
+                array = np.ascontiguousarray(value, kind)
                 self._kept.append(array)
                 setattr(target, name, array.ctypes.data)
             elif issubclass(kinds[name], ctypes.Array):
@@ -270,12 +241,9 @@ class SimdReplicas:
             return
         mesh, (nx, ny, nz) = self._system.mesh, terms.grid
         many = -(-self.n_atoms // w) * w
+        self._fill(mesh, n_atoms=self.n_atoms, nx=nx, ny=ny, nz=nz)
         self._fill(
             mesh,
-            n_atoms=self.n_atoms,
-            nx=nx,
-            ny=ny,
-            nz=nz,
             own=aligned((w * nx * ny * (nz + 8) + 64,)),
             modes=aligned((nx * ny * (nz // 2 + 1) * 2 * w,)),
             fractions=aligned((w, 3, many)),
@@ -402,15 +370,9 @@ class SimdReplicas:
     def step(self, n_steps: int) -> None:
         """Integrate. Raises SimulationError when a constraint cannot be met, or a copy is hotter than chance allows."""
         for done in range(0, n_steps, _CENTRED_STEPS):
-            met = self._program.step(
-                ctypes.byref(self._system),
-                self._positions.ctypes.data,
-                self._low.ctypes.data,
-                self._velocities.ctypes.data,
-                self._random.ctypes.data,
-                self._room.ctypes.data,
-                min(_CENTRED_STEPS, n_steps - done),
-            )
+            arrays = (self._positions, self._low, self._velocities, self._random, self._room)
+            at = [array.ctypes.data for array in arrays]
+            met = self._program.step(ctypes.byref(self._system), *at, min(_CENTRED_STEPS, n_steps - done))
             if met:
                 raise SimulationError("a copy of the molecule blew up: its constraints cannot be met")
             self._place(_outwards(self._positions) + _outwards(self._low))
@@ -452,16 +414,12 @@ class SimdReplicas:
     @property
     def positions_nm(self) -> FloatArray:
         """Positions `(n_replicas, n_atoms, 3)` nm: molecules are whole, and never jump from one cell to another."""
-        return self.positions_of(slice(None))
-
-    def positions_of(self, atoms: Any) -> FloatArray:
-        """Return the positions of some atoms of the System."""
         given = _outwards(self._positions) + _outwards(self._low)
         if self.cell_nm is not None:
             cells = np.repeat(np.moveaxis(self._images, -1, 0), self._units_of_cell[:, 1], axis=1)
             given[:, self._units_of_cell[0, 0] :] += cells @ self.cell_nm
             given += self._origin[:, None]
-        return self._in_order(given)[:, atoms]
+        return self._in_order(given)
 
     def _in_order(self, values: FloatArray) -> FloatArray:
         """Return the program's values of atoms in the System's order; waters that traded places under their names."""

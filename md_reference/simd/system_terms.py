@@ -62,10 +62,8 @@ class Terms:
 
 
 def read_terms(system: Any, biased: Sequence[Sequence[int]], width: int) -> Terms:
-    """Return the terms of a System; torsions of the atoms in `biased` come first, without a force.
-
-    `width`: replicas of a register. Raises SimdUnavailableError for a term that the program does not know.
-    """
+    """Return the terms of a System; torsions of the atoms in `biased` come first, without a force. `width`: replicas of
+    a register. Raises SimdUnavailableError for a term that the program does not know."""
     import openmm
 
     n = system.getNumParticles()
@@ -392,9 +390,7 @@ def influence(cell: FloatArray, alpha: float, grid: tuple[int, int, int]) -> Flo
 
 def polynomials(cutoff: float, alpha: float, dielectric: float, width: int) -> tuple[FloatArray, FloatArray]:
     """Return what water.h's `force` and `energy` hold: of Ewald's complementary part, or of a reaction field (alpha 0).
-
-    Unit charges have the force (1/r^3 - p(r^2)) r, p in `width` pieces, and the energy 1/r + e(2 r^2/cutoff^2 - 1).
-    """
+    Unit charges have the force (1/r^3 - p(r^2)) r, p in `width` pieces, and the energy 1/r + e(2 r^2/cutoff^2 - 1)."""
     square, degree = cutoff**2, FORCE_DEGREES[width]
     p, e = np.zeros((degree + 1, width)), np.zeros(ENERGY_DEGREE + 1)
     if alpha == 0:

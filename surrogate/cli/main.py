@@ -1,4 +1,5 @@
-"""The command line: parsing and printing only. Every verb is one call of `surrogate.api`, imported when it runs."""
+"""The command line: parsing and printing only. Every verb is one call of `surrogate.api`, which is loaded when it runs;
+`bench` and `stress` are calls of `surrogate.bench`."""
 
 from __future__ import annotations
 
@@ -7,6 +8,7 @@ import gc
 import os
 import sys
 import warnings
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -14,20 +16,18 @@ from typing import Annotated, Any
 import typer
 from typer.core import TyperGroup
 
-from surrogate import __version__
-from surrogate.cli.bench_verbs import bench, stress
-from surrogate.cli.flags import as_flags
-from surrogate.cli.parameters import (
-    JsonOpt,
-    OutOpt,
-    SceneArg,
-    WeightsOpt,
-    literal,
-    usage_error,
-    with_options,
+import surrogate as sm
+from surrogate.bench.bench_options import CostErrorOptions, StressOptions
+from surrogate.cli.parameters import JsonOpt, OutOpt, SceneArg, WeightsOpt, literal, usage_error, with_options
+from surrogate.cli.render import (
+    as_flags,
+    print_comparison,
+    print_json,
+    print_library,
+    print_pairs,
+    print_run,
+    print_written,
 )
-from surrogate.cli.render import print_comparison, print_json, print_library, print_pairs, print_run, print_written
-from surrogate.verbs.messages import said
 from surrogate.verbs.options import (
     CampaignOptions,
     CompareOptions,
@@ -39,6 +39,7 @@ from surrogate.verbs.options import (
     RunOptions,
     TrainOptions,
     WindowsOptions,
+    said,
 )
 from systems.errors import SurromdError
 from systems.files.outside import printable
@@ -107,21 +108,22 @@ def _os_error(error: OSError) -> str:
 
 def _version(asked: bool) -> None:
     if asked:
-        typer.echo(f"surromd {__version__}")
+        typer.echo(f"surromd {sm.__version__}")
         raise typer.Exit()
 
 
+_HELP = {"help_option_names": ["-h", "--help"]}
 app = typer.Typer(
     cls=_Group,
     no_args_is_help=True,
     pretty_exceptions_enable=False,
-    context_settings={"help_option_names": ["-h", "--help"]},
+    context_settings=_HELP,
     help="Reference MD with OpenMM, learned surrogate rollouts, and comparison of the two.",
     epilog="SCENE: library name, path (.pdb, .cif, .sdf, .mol, .mol2), smiles:CCO or sequence:ACE-ALA-NME. "
     "Durations carry units: 50ns, 10ps, 2fs.",
 )
+bench = typer.Typer(no_args_is_help=True, context_settings=_HELP, help="Benchmarks on this machine.")
 app.add_typer(bench, name="bench")
-app.command()(stress)
 
 
 @app.callback()
@@ -139,9 +141,7 @@ def demo(
     options: DemoOptions,
 ) -> None:
     """Demonstration on alanine dipeptide: OpenMM, a rollout with shipped weights, the comparison."""
-    from surrogate import api
-
-    result = api.demo(out, options=options)
+    result = sm.demo(out, options=options)
     print_comparison(result, out / "report.html", as_json=False, quiet=options.quiet)
 
 
@@ -155,11 +155,9 @@ def run(
     as_json: JsonOpt = False,
 ) -> None:
     """Simulate SCENE within a wall-time budget, by MD and a surrogate, and evaluate the result."""
-    from surrogate import api
-
     if out is None and not options.dry_run:
         raise usage_error("run needs --out: Folder for trajectory, report and record.")
-    result = api.run(scene, out, options=options)
+    result = sm.run(scene, out, options=options)
     print_run(result, as_json=as_json)
     if result.get("failed"):
         raise typer.Exit(1)
@@ -171,37 +169,25 @@ def systems(
     as_json: JsonOpt = False,
 ) -> None:
     """List the systems of the library, or describe one."""
-    from surrogate import api
-
-    found = api.systems(name)
-    if as_json:
-        print_json(found)
-    elif name is None:
+    found = sm.systems(name)
+    if name is None and not as_json:
         print_library(found)
     else:
-        print_pairs(found[0])
+        print_pairs(found if as_json else found[0], as_json=as_json)
 
 
 @app.command()
 @with_options
 def plan(scene: SceneArg, *, options: PlanOptions, as_json: JsonOpt = False) -> None:
     """Show what a reference run of SCENE will do, what it skips and how long it takes."""
-    from surrogate import api
-
-    summary = api.plan(scene, options=options)
-    if as_json:
-        print_json(summary)
-    else:
-        print_pairs(summary)
+    print_pairs(sm.plan(scene, options=options), as_json=as_json)
 
 
 @app.command()
 @with_options
 def reference(scene: SceneArg, *, out: OutOpt, options: ReferenceOptions, as_json: JsonOpt = False) -> None:
     """Simulate SCENE with OpenMM and write the trajectory."""
-    from surrogate import api
-
-    print_written(api.reference(scene, out, options=options), as_json, options.quiet)
+    print_written(sm.reference(scene, out, options=options), as_json, options.quiet)
 
 
 _CAMPAIGN = """An example of FILE, of two scenes at two temperatures (every setting of `reference` may stand in it):\n
@@ -224,13 +210,9 @@ def campaign(
     as_json: JsonOpt = False,
 ) -> None:
     """Simulate many scenes, temperatures and replicas with OpenMM, on Dask; run again to continue."""
-    from surrogate import api
-
-    result = api.campaign(file, out, options=options)
-    if as_json:
-        print_json(result)
-    elif options.dry_run:
-        print_pairs(result)
+    result = sm.campaign(file, out, options=options)
+    if as_json or options.dry_run:
+        print_pairs(result, as_json=as_json)
     elif not options.quiet:
         typer.echo(f"{result['file']}: {result['summary']}")
     if result.get("failed"):
@@ -251,9 +233,7 @@ def windows(
     as_json: JsonOpt = False,
 ) -> None:
     """Convert reference trajectories into one compact training file."""
-    from surrogate import api
-
-    print_written([api.windows(references, out, options=options)], as_json, options.quiet)
+    print_written([sm.windows(references, out, options=options)], as_json, options.quiet)
 
 
 @app.command()
@@ -272,14 +252,12 @@ def train(
     as_json: JsonOpt = False,
 ) -> None:
     """Train a surrogate on reference trajectories, or a potential of one molecule on quantum forces."""
-    from surrogate import api
-
     if explain:
-        typer.echo(api.explain_training(references, options=options), nl=False)
+        typer.echo(sm.explain_training(references, options=options), nl=False)
         return
     if out is None:
         raise usage_error("train needs --out: Weights to write, .safetensors.")
-    written = api.train(references, out, options=options)
+    written = sm.train(references, out, options=options)
     from surrogate.training.devices import is_first_process
 
     if is_first_process():
@@ -292,14 +270,12 @@ def rollout(
     scene: SceneArg, *, weights: WeightsOpt = None, out: OutOpt, options: RolloutOptions, as_json: JsonOpt = False
 ) -> None:
     """Generate a trajectory of SCENE with a trained surrogate."""
-    from surrogate import api
-
-    print_written(api.rollout(scene, weights, out, options=options), as_json, options.quiet)
+    print_written(sm.rollout(scene, weights, out, options=options), as_json, options.quiet)
 
 
 @dataclass(frozen=True, kw_only=True)
 class CompareShown(CompareOptions, Quiet):
-    """What `compare` can be told, and what the command does about its result."""
+    """Options of `compare`, and what the command does about its result."""
 
     show_all: bool = option("Print all metrics, not only the verdict.", False, words=("all",))
     fail_on: str | None = option(
@@ -322,9 +298,7 @@ def compare(
     as_json: JsonOpt = False,
 ) -> None:
     """Compare trajectories with a reference: accuracy, error bars, verdict, cost."""
-    from surrogate import api
-
-    result = api.compare(reference, candidates, out, options=options)
+    result = sm.compare(reference, candidates, out, options=options)
     print_comparison(result, out, as_json=as_json, quiet=options.quiet, show_all=options.show_all)
     bad = {"different": ("different", "broken"), "broken": ("broken",)}
     if options.fail_on is not None and any(j.status in bad[options.fail_on] for j in result.evaluations):
@@ -346,13 +320,75 @@ def info(
     as_json: JsonOpt = False,
 ) -> None:
     """Describe a file and its origin; with weights and a SCENE, whether they cover it."""
-    from surrogate import api
+    print_pairs(sm.info(path, scene), as_json=as_json)
 
-    found = api.info(path, scene)
+
+# ---- benchmarks -----------------------------------------------------------------------------------------------------
+
+
+@bench.callback()
+def _benchmarks() -> None:
+    """Keep `bench` a group, however many benchmarks it has."""
+
+
+@bench.command(name="cost-error")
+@with_options
+def cost_error(
+    reference: Annotated[str, typer.Argument(metavar="REFERENCE", help="Held-out reference: a file, folder or glob.")],
+    replicate: Annotated[str, typer.Argument(metavar="REPLICATE", help="Independent reference of the same length.")],
+    weights: Annotated[
+        list[str], typer.Option("--weights", "-w", help="Weights by name or .safetensors file; repeatable.")
+    ],
+    out: Annotated[Path, typer.Option("--out", "-o", help="Output folder.")] = Path("cost-error"),
+    *,
+    options: CostErrorOptions,
+    as_json: JsonOpt = False,
+) -> None:
+    """Run time against error of a surrogate at many settings, beside OpenMM, on one core. Goes on where it stopped.
+
+    REFERENCE and REPLICATE: two runs that the weights were not trained on.
+    """
+    from surrogate.bench.cost_error import cost_error as run
+    from surrogate.bench.cost_page import markdown
+
+    report = _reporting(options.quiet or as_json)
+    result = run(reference, replicate, weights, out, options, report=report)
+    files = f"{out}: cost_error.json, cost_error.md, cost_error.svg"
+    _print_tables(result, markdown, files, as_json=as_json, quiet=options.quiet)
+
+
+@app.command()
+@with_options
+def stress(
+    weights: Annotated[str, typer.Argument(metavar="WEIGHTS", help="Name of shipped weights, or a .safetensors file.")],
+    out: Annotated[Path, typer.Option("--out", "-o", help="Output folder.")] = Path("surromd-stress"),
+    *,
+    options: StressOptions,
+    as_json: JsonOpt = False,
+) -> None:
+    """Stress-test WEIGHTS: long rollouts, unusual inputs, precision, solvers, beside OpenMM."""
+    from surrogate.bench.stress import choose_config, stress_weights
+    from surrogate.bench.stress_page import markdown
+
+    report = _reporting(options.quiet or as_json)
+    result = stress_weights(weights, out, choose_config(options), scene=options.scene, report=report)
+    _print_tables(result, markdown, f"{out}: stress.json, stress.md", as_json=as_json, quiet=options.quiet)
+
+
+def _reporting(quiet: bool) -> Callable[[str], None]:
+    return lambda line: None if quiet else typer.echo(f"running: {line}", err=True)
+
+
+def _print_tables(result: Any, markdown: Callable[[Any], str], files: str, *, as_json: bool, quiet: bool) -> None:
+    """Print what a benchmark has found, and which files it has written."""
     if as_json:
-        print_json(found)
-    else:
-        print_pairs(found)
+        print_json(result)
+    elif not quiet:
+        typer.echo(markdown(result))
+        typer.echo(files)
+
+
+# ---- the process ----------------------------------------------------------------------------------------------------
 
 
 def _hush_readers() -> None:

@@ -107,8 +107,8 @@ def with_options(command: Callable[..., None]) -> Callable[..., None]:
 def _config_option(known: Iterable[Option]) -> Any:
     """Return `--config`, whose help names the tables of the file."""
     tables = dict.fromkeys(found.section or found.name for found in known if found.section or found.kind is dict)
-    told = "".join(f", [{table}]" for table in tables)
-    return typer.Option("--config", help=literal(f"TOML of these options{told}; what is given here comes first."))
+    listed = "".join(f", [{table}]" for table in tables)
+    return typer.Option("--config", help=literal(f"TOML of these options{listed}; what is given here comes first."))
 
 
 def _resolved(kind: type, given: dict[str, Any]) -> Any:

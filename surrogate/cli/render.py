@@ -1,17 +1,54 @@
-"""What the command line prints: records, what was written, verdicts."""
+"""What the command line prints: records, what was written, verdicts; in messages, options that are named as Python's
+keywords become flags."""
 
 from __future__ import annotations
 
+import re
+from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import typer
 
-from surrogate.cli.flags import as_flags
+from surrogate.bench.bench_options import CostErrorOptions, StressOptions
+from surrogate.verbs.options import VERB_OPTIONS
 from systems.files.outside import printable
+from systems.options import Option, options_of
 
 if TYPE_CHECKING:
     from surrogate.comparison.comparison import Comparison, Evaluation
+
+
+# `overwrite`, `overwrite=True`, `timestep_ps='1fs'`
+_NAMED = re.compile(r"`([a-z][a-z_]*)(?:=([^`]+))?`")
+# Arguments of the Python calls that are options on the command line, and one that is nowhere else.
+_ARGUMENTS = {"out": "--out", "weights": "--weights", "config": "--config"}
+
+
+@cache
+def _known() -> dict[str, Option]:
+    # Of a name that several have the last one counts.
+    kinds = [CostErrorOptions, StressOptions, *VERB_OPTIONS.values()]
+    return {name: found for kind in kinds for name, found in options_of(kind).items()}
+
+
+def as_flags(text: str) -> str:
+    """Return a message in which `overwrite=True` is --overwrite and `timestep_ps='1fs'` is --timestep 1fs. What stands
+    in a table of a `config` file alone is said so; any other word in backticks stays."""
+    return _NAMED.sub(_flag, text)
+
+
+def _flag(match: re.Match[str]) -> str:
+    name, value = match.groups()
+    found = _known().get(name)
+    flag = _ARGUMENTS.get(name) or (found.flags[0] if found is not None and found.flags else None)
+    if flag is not None:
+        return flag if value in (None, "True") else f"{flag} {value.strip(chr(39))}"
+    if found is not None and found.section:
+        said = found.key if value is None else f"{found.key} = {value.replace(chr(39), chr(34))}"
+        return f"{said} in [{found.section}] of --config"
+    return match.group()
 
 
 def _say(text: str) -> None:
@@ -26,8 +63,10 @@ def print_json(value: Any) -> None:
     _say(json.dumps(value, indent=2, default=str))
 
 
-def print_pairs(record: dict[str, Any], indent: int = 0) -> None:
-    """Print a record as aligned lines; nested records are indented, lists of plain values joined."""
+def print_pairs(record: Any, indent: int = 0, *, as_json: bool = False) -> None:
+    """Print a record as aligned lines, nested records indented, lists of plain values joined; or as JSON."""
+    if as_json:
+        return print_json(record)
     shown = {k: v for k, v in record.items() if v is not None and v != () and v != []}
     width = max((len(k) for k in shown), default=0)
     for key, value in shown.items():
@@ -73,16 +112,15 @@ def print_library(entries: list[dict[str, Any]]) -> None:
 
 def print_written(paths: list[Path], as_json: bool, quiet: bool) -> None:
     """Say what was written: its length, what it cost, and how the run went."""
-    from surrogate import api
+    import surrogate as sm
 
-    records = [api.info(path) for path in paths] if as_json or not quiet else []
+    records = [sm.info(path) for path in paths] if as_json or not quiet else []
     if as_json:
-        print_json(records)
+        return print_json(records)
     for path, record in zip(paths, records, strict=False):
-        if not as_json:
-            _say(f"{path}: {record['summary']}")
-            for line in record.get("details", []):
-                _say(f"  {line}")
+        _say(f"{path}: {record['summary']}")
+        for line in record.get("details", []):
+            _say(f"  {line}")
 
 
 def print_run(record: dict[str, Any], *, as_json: bool) -> None:
@@ -106,28 +144,24 @@ def print_comparison(result: Comparison, report: Path, *, as_json: bool, quiet: 
     """Print each candidate's three lines (use it or not, for what, why) and its verdict, as its report has them; with
     `show_all` what is wrong and every row between reference and replicate."""
     if as_json:
-        print_json(result.to_dict())
-        return
+        return print_json(result.to_dict())
     for evaluation in () if quiet else result.evaluations:
         use, *more = evaluation.in_short
-        for line in (f"{evaluation.summary.label}: {use}", *(f"  {x}" for x in (*more, evaluation.verdict))):
-            _say(line)
+        lines = [f"{evaluation.summary.label}: {use}", *(f"  {line}" for line in (*more, evaluation.verdict))]
         if show_all:
-            for finding in evaluation.findings:
-                _say(f"  - {finding}")
-            _print_rows(evaluation)
+            lines += [*(f"  - {finding}" for finding in evaluation.findings), *_rows(evaluation)]
         if evaluation.speed_ratio is not None:
-            _say(f"  simulated time per wall time: {evaluation.speed_ratio:.3g} times the reference's")
-        for note in evaluation.notes:
-            _say(f"  note: {note}")
+            lines.append(f"  simulated time per wall time: {evaluation.speed_ratio:.3g} times the reference's")
+        for line in (*lines, *(f"  note: {note}" for note in evaluation.notes)):
+            _say(line)
     for note in () if quiet else result.notes:
         _say(f"note: {note}")
     _say(f"report: {report}")
 
 
-def _print_rows(evaluation: Evaluation) -> None:
-    _say(f"  {'':<52} {'reference':>10} {'candidate':>10} {'replicate':>10}")
+def _rows(evaluation: Evaluation) -> Iterator[str]:
+    yield f"  {'':<52} {'reference':>10} {'candidate':>10} {'replicate':>10}"
     for row in evaluation.rows:
         figures = (row.reference, row.candidate, row.replicate)
         numbers = " ".join(f"{'-' if e is None else _plain(e.value, 4):>10}" for e in figures)
-        _say(f"  {row.metric[:52]:<52} {numbers} {row.unit:<8} {row.verdict}")
+        yield f"  {row.metric[:52]:<52} {numbers} {row.unit:<8} {row.verdict}"

@@ -19,7 +19,7 @@ from systems.trajectory.codec import DIFFERENCE_COLUMN
 from systems.units import whole_steps
 
 if TYPE_CHECKING:
-    from md_reference.run.frame_relaxation import Relaxed
+    from md_reference.run.engine import Relaxed
     from surrogate.models.weights import Weights
 
 
@@ -50,7 +50,7 @@ class Coupling:
     def __init__(self, weights: Weights, *, platform: str = "auto") -> None:
         from md_reference.forces.forcefield import build_system, resolve
         from md_reference.forces.spec import ForceFieldSpec
-        from md_reference.run.frame_relaxation import Relaxer
+        from md_reference.run.engine import Relaxer
 
         self._scene, self._conditions = weights.domain.scene, weights.domain.conditions
         self._platform, self._lag_ps = platform, weights.domain.lag_ps

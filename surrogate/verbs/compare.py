@@ -1,4 +1,4 @@
-"""The comparison as a verb: files in, a comparison and its report out."""
+"""The verbs `compare` (files in, a comparison and its report out) and `demo`, which makes such files first."""
 
 from __future__ import annotations
 
@@ -7,8 +7,11 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from surrogate.verbs.options import CompareOptions, PathLike, Trajectories
+from surrogate.models.architecture import weights_path
+from surrogate.verbs.options import CompareOptions, DemoOptions, PathLike, Trajectories
 from surrogate.verbs.outputs import check_outputs, find_trajectories
+from surrogate.verbs.reference import reference as run_reference
+from surrogate.verbs.rollout import rollout
 from systems.errors import InputError
 from systems.options import options_as_keywords
 
@@ -39,7 +42,7 @@ def compare(
     evaluate the potential energy of every k-th frame too, by the force field that the reference's file names. A report
     that is there stays unless `overwrite`. Raises InputError, TrajectoryError, OutOfDomainError.
     """
-    from surrogate.comparison.comparison import compare as compare
+    from surrogate.comparison.comparison import compare as evaluate
     from surrogate.comparison.read.ensemble import load_ensemble
 
     if isinstance(candidates, str | Path):
@@ -51,29 +54,23 @@ def compare(
         raise InputError(f"{len(labels)} labels for {len(candidates)} candidates.")
     if out_html is not None:
         page = Path(out_html)
-        check_outputs([page], [".html"], overwrite=options.overwrite)
-        beside = [page.with_suffix(".json"), page.with_suffix(".md")]
-        check_outputs(beside, [".json", ".md"], overwrite=options.overwrite)
+        for suffix in (".html", ".json", ".md"):
+            named = page if suffix == ".html" else page.with_suffix(suffix)
+            check_outputs([named], [suffix], overwrite=options.overwrite)
     n = 1 + len(candidates) + (options.replicate is not None)
     tops, lags = _one_each("top", options.top, n), _one_each("dt_ps", options.dt_ps, n)
     ref = load_ensemble(find_trajectories(reference), top=tops[0], lag_ps=lags[0])
-    others = [
-        load_ensemble(
-            find_trajectories(candidate),
-            label=labels[k] if labels else None,
-            template=ref.scene,
-            top=tops[1 + k],
-            lag_ps=lags[1 + k],
-        )
-        for k, candidate in enumerate(candidates)
-    ]
-    replicate_baseline = None
+    others = []
+    for k, candidate in enumerate(candidates, 1):
+        label = labels[k - 1] if labels else None
+        files = find_trajectories(candidate)
+        others.append(load_ensemble(files, label=label, template=ref.scene, top=tops[k], lag_ps=lags[k]))
+    replicate = None
     if options.replicate is not None:
-        replicate_baseline = load_ensemble(
-            find_trajectories(options.replicate), template=ref.scene, top=tops[-1], lag_ps=lags[-1]
-        )
+        files = find_trajectories(options.replicate)
+        replicate = load_ensemble(files, template=ref.scene, top=tops[-1], lag_ps=lags[-1])
     energy_fn = _relaxed_energy(ref.scene, ref.record) if options.energies else None
-    result = compare(ref, others, replicate_baseline, ref.scene, energy_fn=energy_fn)
+    result = evaluate(ref, others, replicate, ref.scene, energy_fn=energy_fn)
     if out_html is not None:
         from surrogate.comparison.report.report import write_report
 
@@ -100,7 +97,7 @@ def _relaxed_energy(scene: Scene, record: dict[str, Any]) -> Callable[[npt.NDArr
     """Return what gives the energy in kJ/mol of a frame with its stiff bonds at rest, infinity where there is none."""
     from md_reference.forces.forcefield import build_system, resolve
     from md_reference.forces.spec import ForceFieldSpec
-    from md_reference.run.frame_relaxation import Relaxer
+    from md_reference.run.engine import Relaxer
     from systems.errors import SimulationError
 
     if record.get("force_field") is None or record.get("solvent") is None:
@@ -115,3 +112,29 @@ def _relaxed_energy(scene: Scene, record: dict[str, Any]) -> Callable[[npt.NDArr
             return math.inf
 
     return energy
+
+
+@options_as_keywords(DemoOptions)
+def demo(out_dir: PathLike = "surromd-demo", *, options: DemoOptions) -> Comparison:
+    """The whole way on alanine dipeptide: two OpenMM runs, longer rollouts with shipped weights, the comparison.
+
+    Writes reference_r0.h5, reference_r1.h5 (the replicate), surrogate_r0.h5, ..., report.html and report.json into
+    `out_dir`, replacing those of an earlier demo.
+    """
+    folder = Path(out_dir)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except FileExistsError:
+        raise InputError(f"{folder} is a file; name a folder with `out`.") from None
+    name, weights = "alanine-dipeptide", "peptides"
+    weights_path(weights)  # missing weights are noticed before anything is simulated
+    try:
+        shared: dict[str, Any] = {"seed": options.seed, "quiet": options.quiet, "overwrite": True}
+        out = folder / "reference.h5"
+        ref, replicate = run_reference(name, out, time_ps=options.reference_ps, replicas=2, **shared)
+        out, n = folder / "surrogate.h5", options.rollout_replicas
+        saved = {"save_every_ps": options.rollout_save_every_ps}
+        rolled = rollout(name, weights, out, time_ps=options.rollout_ps, replicas=n, **saved, **shared)
+    except KeyboardInterrupt:
+        raise KeyboardInterrupt(f"what was written is in {folder}; the demo starts over when it is run again") from None
+    return compare(ref, [rolled], folder / "report.html", replicate=replicate, labels=["surrogate"], overwrite=True)

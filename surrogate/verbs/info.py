@@ -1,4 +1,4 @@
-"""The verb `info`: what a file is and where it came from. Files are told apart by what they hold."""
+"""The verb `info`: what a file is and where it came from. Files are recognised by what they hold."""
 
 from __future__ import annotations
 
@@ -26,16 +26,13 @@ def info(path: PathLike, scene: str | None = None) -> dict[str, Any]:
     TrajectoryError or WeightsError when it is damaged.
     """
     named = Path(path) if Path(path).exists() else shipped_weights().get(str(path), Path(path))
-    if scene is not None:
-        if not named.exists():
-            known = ", ".join(shipped_weights())
-            raise InputError(f"{path}: no such file, nor shipped weights of that name ({known}).")
-        if named.suffix.lower() != ".safetensors":
-            raise InputError(f"{path} is no weights file; what covers {scene} can be asked of weights alone.")
-        return _coverage(named, scene)
-    if not named.is_dir():
-        return describe_file(named)
-    return _run(named) or describe_campaign(named)
+    if scene is None:
+        return describe_file(named) if not named.is_dir() else _run(named) or describe_campaign(named)
+    if not named.exists():
+        raise InputError(f"{path}: no such file, nor shipped weights of that name ({', '.join(shipped_weights())}).")
+    if named.suffix.lower() != ".safetensors":
+        raise InputError(f"{path} is no weights file; what covers {scene} can be asked of weights alone.")
+    return _coverage(named, scene)
 
 
 def _run(folder: Path) -> dict[str, Any] | None:
@@ -76,19 +73,16 @@ def _coverage(path: Path, scene: str) -> dict[str, Any]:
 
 
 def describe_file(path: Path) -> dict[str, Any]:
-    """Return a JSON-able record of a file; `summary` is one line about it.
+    """Return a JSON-able record of a file; `summary` is one line about it. Raises InputError when there is no such
+    file, TrajectoryError or WeightsError when it is damaged."""
+    from surrogate.data import is_windows
 
-    Raises InputError when there is no such file, TrajectoryError or WeightsError when it is damaged.
-    """
     if not path.is_file():
         raise InputError(f"{path}: no such file.")
     if path.suffix.lower() == ".safetensors":
         return _weights(path)
-    from surrogate.data import is_windows
 
-    if path.suffix.lower() in (".h5", ".hdf5") and is_windows(path):
-        return _windows(path)
-    return _trajectory(path)
+    return _windows(path) if path.suffix.lower() in (".h5", ".hdf5") and is_windows(path) else _trajectory(path)
 
 
 def _trajectory(path: Path) -> dict[str, Any]:
@@ -110,12 +104,7 @@ def _trajectory(path: Path) -> dict[str, Any]:
         "file": str(path),
         "type": record.get("kind", "foreign") + " trajectory",
         "summary": f"{n_frames} frames of {n_atoms} atoms{span}{wall}{unfinished}",
-        "details": [
-            *summary_lines(record.get("summary") or {}),
-            *training_lines(record),
-            *precision_lines(record),
-            *intervention_lines(record),
-        ],
+        "details": [*summary_lines(record.get("summary") or {}), *rollout_lines(record), *intervention_lines(record)],
         "scene": None if scene is None else scene.name,
         "formula": None if scene is None else scene.formula,
         "topology_hash": None if scene is None else scene.topology_hash,
@@ -130,17 +119,14 @@ def _trajectory(path: Path) -> dict[str, Any]:
     }
 
 
-def precision_lines(record: dict[str, Any]) -> list[str]:
-    """Return the precision in which a rollout's network was evaluated, and why; nothing of other files."""
-    reason = record.get("precision_reason")
-    return [] if reason is None else [f"network in {record.get('precision')}: {reason}"]
-
-
-def training_lines(record: dict[str, Any]) -> list[str]:
-    """Return how a rollout's molecule differs from what its weights were trained on, line by line; nothing if not."""
+def rollout_lines(record: dict[str, Any]) -> list[str]:
+    """Return how a rollout's molecule differs from what its weights were trained on, and in which precision its network
+    was evaluated, and why; nothing of other files."""
     lines = [UNSEEN] if record.get("unseen_molecule") else []
     beyond = record.get("out_of_domain") or []
-    return [*lines, *(f"outside the training domain (`force=True`): {d['what']}: {d['reason']}" for d in beyond)]
+    lines += [f"outside the training domain (`force=True`): {d['what']}: {d['reason']}" for d in beyond]
+    reason = record.get("precision_reason")
+    return lines if reason is None else [*lines, f"network in {record.get('precision')}: {reason}"]
 
 
 def _percent(share: float) -> str:
@@ -161,19 +147,17 @@ def intervention_lines(record: dict[str, Any]) -> list[str]:
     if helped:
         reasons = sorted(summary.get("reasons", {}).items(), key=lambda r: -r[1])
         line += f" ({_percent(helped / max(chunks, 1))}): " + ", ".join(f"{name} ({n} frames)" for name, n in reasons)
-    lines = [line]
-    if summary["frames"]:
-        done = ", ".join(f"{n} {name}" for name, n in summary["frames"].items())
-        seconds = summary.get("seconds", {})
-        extra = {name: value for name, value in seconds.items() if name != "draw"}
-        drawn_s = seconds.get("draw") or math.inf
-        shares = ", ".join(f"{name} {_percent(v / drawn_s)}" for name, v in extra.items())
-        lines += [
-            f"frames that are not the surrogate's first draw: {done}",
-            f"cost beside drawing chunks: {shares}",
-            *(f"bias: {why}" for why in summary["bias"]),
-        ]
-    return lines
+    if not summary["frames"]:
+        return [line]
+    seconds = dict(summary.get("seconds", {}))
+    drawn_s = seconds.pop("draw", 0.0) or math.inf
+    return [
+        line,
+        "frames that are not the surrogate's first draw: "
+        + ", ".join(f"{n} {name}" for name, n in summary["frames"].items()),
+        "cost beside drawing chunks: " + ", ".join(f"{name} {_percent(v / drawn_s)}" for name, v in seconds.items()),
+        *(f"bias: {why}" for why in summary["bias"]),
+    ]
 
 
 def _windows(path: Path) -> dict[str, Any]:

@@ -1,8 +1,11 @@
-"""What each verb can be told: one dataclass a verb, made of those that verbs share (`systems.options`)."""
+"""Options of the verbs: one dataclass a verb, made of those that verbs share (`systems.options`); and the
+lines that verbs write to stderr, which name options in backticks."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import sys
+from collections.abc import Callable, Sequence
+from contextvars import ContextVar
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -18,60 +21,47 @@ PathLike = str | Path
 Trajectories = PathLike | Sequence[PathLike]
 
 
-def _one_or_none(text: str, what: str) -> str | None:
-    return None if text == "-" else text
+# How options that a line names in backticks are written; the command line, where they are flags, sets its own.
+said: ContextVar[Callable[[str], str]] = ContextVar("said", default=str)
 
 
-def _parse_dt_ps(text: str, what: str) -> float | None:
-    return None if text == "-" else parse_time_ps(text, what)
+def tell(name: str, line: str) -> None:
+    """Write a line about a scene or a file to stderr."""
+    sys.stderr.write(f"{name}: {said.get()(line)}\n")
 
 
 @dataclass(frozen=True, kw_only=True)
 class Seeded:
-    """Options of verbs that draw random numbers."""
-
     seed: int = option("Random seed.", 0, within=(0, None))
 
 
 @dataclass(frozen=True, kw_only=True)
 class Replicated:
-    """Options of verbs that run a scene several times."""
-
     replicas: int = option("Independent runs; NAME.h5 becomes NAME_r0.h5, ...", 1, within=(1, None))
 
 
 @dataclass(frozen=True, kw_only=True)
 class Joining(Replicated):
-    """Options of verbs that write the trajectories of replicas."""
-
     join: bool = option("Also write all replicas into one file, NAME.h5.", False)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Quiet:
-    """Options of verbs that show their progress."""
-
     quiet: bool = option("No progress bar and no summary.", False, words=("quiet", "q"))
 
 
 @dataclass(frozen=True, kw_only=True)
 class Overwriting:
-    """Options of verbs that write a file."""
-
     overwrite: bool = option("Overwrite existing output.", False)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Resuming:
-    """Options of verbs that can go on where they were stopped."""
-
     resume: bool = option("Continue an interrupted run of the same settings.", False)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Validated:
-    """Options of verbs that hold frames out of a training."""
-
     validation: Trajectories | None = option(
         "Trajectory kept for validation; repeatable.", None, unset="the last 5 % of each"
     )
@@ -79,10 +69,8 @@ class Validated:
 
 @dataclass(frozen=True, kw_only=True)
 class MDSettings:
-    """What the MD is and how it is run: fields of MDConfig, ForceFieldSpec and WaterBox.
-
-    What is left open (None) is settled for the scene: by the protocol that is asked for, else by its default there.
-    """
+    """What the MD is and how it is run: fields of MDConfig, ForceFieldSpec and WaterBox. What is left open (None) is
+    resolved for the scene: by the protocol that is asked for, else by its default there."""
 
     protocol: str | None = option("Settings of a published protocol: md17, md22, mdgen, fast-folders.", None)
     force_field: str | None = from_field(ForceFieldSpec, "force_field", None, unset="auto")
@@ -106,14 +94,14 @@ class MDSettings:
 
 @dataclass(frozen=True, kw_only=True)
 class PlanOptions(MDSettings, Replicated, Preparation):
-    """What `plan` can be told."""
+    """Options of `plan`."""
 
     time_ps: float | None = option("Run length whose wall time is estimated.", None)
 
 
 @dataclass(frozen=True, kw_only=True)
 class ReferenceOptions(MDSettings, Joining, Preparation, Seeded, Resuming, Overwriting, Quiet):
-    """What `reference` can be told."""
+    """Options of `reference`."""
 
     time_ps: float = from_field(MDConfig, "time_ps")
     save_every_ps: float | None = from_field(MDConfig, "save_every_ps", None)
@@ -124,27 +112,25 @@ class ReferenceOptions(MDSettings, Joining, Preparation, Seeded, Resuming, Overw
 
 @dataclass(frozen=True, kw_only=True)
 class RolloutOptions(RolloutConfig, Joining, Preparation, Resuming, Overwriting, Quiet):
-    """What `rollout` can be told."""
+    """Options of `rollout`."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class OnDask:
-    """Options of verbs whose work Dask hands out."""
-
     workers: int | None = option("Number of local worker processes.", None, within=(1, None), unset="one per core")
     scheduler: str | None = option("Address of a Dask scheduler, such as tcp://host:8786.", None)
 
 
 @dataclass(frozen=True, kw_only=True)
 class CampaignOptions(OnDask, Quiet):
-    """What `campaign` can be told beside its file."""
+    """Options of `campaign` beside its file."""
 
     dry_run: bool = option("List the runs without starting them.", False)
 
 
 @dataclass(frozen=True, kw_only=True)
 class WindowsOptions(Validated, Overwriting, Quiet):
-    """What `windows` can be told."""
+    """Options of `windows`."""
 
     velocities: bool = option("Store velocities (needed by painet).", False)
     canonical: bool = option("Superpose frames on one pose, unless velocities are kept.", True, words=None)
@@ -152,17 +138,19 @@ class WindowsOptions(Validated, Overwriting, Quiet):
 
 @dataclass(frozen=True, kw_only=True)
 class CompareOptions(Overwriting):
-    """What `compare` can be told. Of `top` and `dt_ps` one stands for all, or there is one for the reference, each
+    """Options of `compare`. Of `top` and `dt_ps` one stands for all, or there is one for the reference, each
     candidate and the replicate, in this order, None where the file says it itself."""
 
     replicate: Trajectories | None = option("Independent reference run, for the replicate baseline.", None)
     top: PathLike | Sequence[PathLike | None] | None = option(
-        "Topology file: one for all, or one each for REF, every TRAJ and the replicate.", None, read=_one_or_none
+        "Topology file: one for all, or one each for REF, every TRAJ and the replicate.",
+        None,
+        read=lambda text, what: None if text == "-" else text,
     )
     dt_ps: float | Sequence[float | None] | None = option(
         "Time between frames, where a file does not say; as the topology. '-' leaves one out.",
         None,
-        read=_parse_dt_ps,
+        read=lambda text, what: None if text == "-" else parse_time_ps(text, what),
     )
     labels: str | Sequence[str] | None = option("Names of the candidates in the report.", None, words=None)
     energies: bool = option("Also compare potential energies, by the reference's force field.", False)
@@ -170,7 +158,7 @@ class CompareOptions(Overwriting):
 
 @dataclass(frozen=True, kw_only=True)
 class DemoOptions(Seeded, Quiet):
-    """What `demo` can be told."""
+    """Options of `demo`."""
 
     reference_ps: float = option("Of each of two OpenMM runs.", 3_000.0, words=None)
     rollout_ps: float = option("Of each rollout.", 3_200.0, words=None)
@@ -180,7 +168,7 @@ class DemoOptions(Seeded, Quiet):
 
 @dataclass(frozen=True, kw_only=True)
 class TrainOptions(Validated, Seeded, Resuming, Overwriting, Quiet):
-    """What `train` can be told. What is left open is chosen to suit the references, and said with its reason."""
+    """Options of `train`. What is left open is chosen to suit the references, and said with its reason."""
 
     arch: str | None = option(
         "Model architecture: lam-slide, painet, egnn, a baseline, or an installed plug-in.",
@@ -201,7 +189,7 @@ class TrainOptions(Validated, Seeded, Resuming, Overwriting, Quiet):
 
 @dataclass(frozen=True, kw_only=True)
 class RunOptions(MDSettings, Preparation, OnDask, Seeded, Resuming, Overwriting, Quiet):
-    """What `run` can be told. `workers` and `scheduler` are those of many molecules."""
+    """Options of `run`. `workers` and `scheduler` are those of many molecules."""
 
     budget_s: float = option("Total wall-time budget, such as 1h.", 600.0)
     way: str = option(

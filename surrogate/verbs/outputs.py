@@ -1,10 +1,11 @@
-"""Files that verbs write and read: checked before the work starts, told of at its end, replicas found by pattern."""
+"""Files that verbs write and read: checked before the work starts, reported at its end, replicas found by pattern."""
 
 from __future__ import annotations
 
 import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from glob import glob
 from pathlib import Path
 
 from md_reference.campaign.manifest import campaign_folder, campaign_trajectories
@@ -13,8 +14,6 @@ from systems.errors import InputError
 from systems.trajectory.checkpoint import checkpoint_path, frames_in
 from systems.trajectory.codec import WRITTEN
 from systems.trajectory.companion_writer import refuse_foreign_topology
-
-TRAJECTORY_SUFFIXES = WRITTEN
 
 
 def check_outputs(
@@ -38,7 +37,7 @@ def check_outputs(
             raise InputError(f"{path} is a folder; name a file.")
         if path.exists() and not (resume or overwrite):
             raise InputError(f"{path} exists; add `overwrite=True` to replace it, or choose another name.")
-        if path.suffix.lower() in TRAJECTORY_SUFFIXES and suffixes == TRAJECTORY_SUFFIXES and not resume:
+        if path.suffix.lower() in WRITTEN and suffixes == WRITTEN and not resume:
             refuse_foreign_topology(path)
 
 
@@ -52,9 +51,7 @@ def join_replicas(written: Sequence[Path], joined: Sequence[Path], *, overwrite:
 @contextmanager
 def summarised_outputs(paths: Sequence[Path], *, resumable: str = "") -> Iterator[None]:
     """Run a verb that writes trajectories; on Ctrl-C say what is kept, as the message of KeyboardInterrupt.
-
-    `resumable`: what the user does to go on, said when there is something to go on from.
-    """
+    `resumable`: what the user does to go on, said when there is something to go on from."""
     try:
         yield
     except KeyboardInterrupt:
@@ -67,8 +64,7 @@ def _kept(counts: dict[Path, int]) -> str:
         return ", ".join(f"{path} holds {frames} frames" for path, frames in counts.items())
     first, *_, last = counts
     fewest, most = min(counts.values()), max(counts.values())
-    frames = str(most) if fewest == most else f"{fewest} to {most}"
-    return f"{first} to {last.name} hold {frames} frames each"
+    return f"{first} to {last.name} hold {most if fewest == most else f'{fewest} to {most}'} frames each"
 
 
 def find_trajectories(spec: Trajectories, *, verify: bool = False) -> list[Path]:
@@ -100,9 +96,7 @@ def find_trajectories(spec: Trajectories, *, verify: bool = False) -> list[Path]
         parts = [part.strip() for part in text.split(",") if part.strip()]
         return [p for part in parts for p in find_trajectories(part, verify=verify)]
     if any(c in text for c in "*?["):
-        import glob
-
-        found = _counted_once([Path(p) for p in sorted(glob.glob(text)) if not p.endswith(".meta.h5")])
+        found = _counted_once([Path(p) for p in sorted(glob(text)) if not p.endswith(".meta.h5")])
         if found:
             return found
         raise InputError(f"{text}: no file matches.")

@@ -7,11 +7,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from surrogate.progress import progress_bar
-from surrogate.verbs.messages import tell
-from surrogate.verbs.options import PlanOptions, ReferenceOptions
-from surrogate.verbs.outputs import TRAJECTORY_SUFFIXES, check_outputs, join_replicas, summarised_outputs
-from surrogate.verbs.scene_listing import prepare_scene
+from surrogate.verbs.options import PlanOptions, ReferenceOptions, tell
+from surrogate.verbs.outputs import check_outputs, join_replicas, summarised_outputs
+from surrogate.verbs.scenes import prepare_scene
 from systems.options import options_as_keywords
+from systems.trajectory.codec import WRITTEN
 
 if TYPE_CHECKING:
     from md_reference.run.simulate import MDConfig
@@ -29,7 +29,7 @@ def plan(scene: str | Path | Scene, options: PlanOptions) -> dict[str, Any]:
 
     molecule = prepare_scene(scene, options, quiet=False)
     molecule, config, protocol = resolve_run(molecule, options, {"time_ps": options.time_ps or 0.0}, quiet=True)
-    found = make_plan(molecule, config, replicas=options.replicas).to_dict()
+    found = asdict(make_plan(molecule, config, replicas=options.replicas))
     return found | ({"protocol": protocol} if protocol else {})
 
 
@@ -58,7 +58,7 @@ def reference(scene: str | Path | Scene, out: str | Path, options: ReferenceOpti
 
     outs = replica_paths(Path(out), options.replicas)
     joined = [Path(out)] if options.join and len(outs) > 1 else []
-    check_outputs([*outs, *joined], TRAJECTORY_SUFFIXES, resume=options.resume, overwrite=options.overwrite)
+    check_outputs([*outs, *joined], WRITTEN, resume=options.resume, overwrite=options.overwrite)
     molecule = prepare_scene(scene, options, quiet=options.quiet)
     molecule, config, protocol = resolve_run(molecule, options, {"time_ps": options.time_ps}, quiet=options.quiet)
     _ = config.n_frames, config.steps_per_frame  # uneven intervals are refused before anything runs
@@ -84,10 +84,8 @@ def reference(scene: str | Path | Scene, out: str | Path, options: ReferenceOpti
 def resolve_run(
     scene: Scene, options: PlanOptions | ReferenceOptions, length: dict[str, float], *, quiet: bool
 ) -> tuple[Scene, MDConfig, str]:
-    """Return the scene, solvated if asked, the settings of a run, and a line about what the protocol decided.
-
-    Of the options those count that are settings of a run (MDConfig, ForceFieldSpec) or make its box. Raises InputError.
-    """
+    """Return the scene, solvated if asked, the settings of a run, and a line about what the protocol decided. Of the
+    options those count that are settings of a run (MDConfig, ForceFieldSpec) or make its box. Raises InputError."""
     from md_reference.forces.forcefield import resolve
     from md_reference.forces.solvation import require_molecules, solvate_if_asked
     from md_reference.forces.spec import ForceFieldSpec, at_level
@@ -108,13 +106,9 @@ def resolve_run(
         require_molecules(config.force)
     dry = scene
     scene = solvate_if_asked(
-        scene,
-        config.force,
-        options.padding_nm,
-        options.ionic_strength_molar,
-        seed=seed,
-        temperature_k=config.temperature_k,
-    )
+        scene, config.force, seed=seed, temperature_k=config.temperature_k, padding_nm=options.padding_nm,
+        ionic_strength_molar=options.ionic_strength_molar,
+    )  # fmt: skip
     config = resolved(scene, config)
     if not quiet:
         if scene is not dry:

@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING
 from surrogate.models.architecture import weights_path
 from surrogate.progress import progress_bar
 from surrogate.sampling.config import RolloutConfig
-from surrogate.verbs.messages import tell
-from surrogate.verbs.options import RolloutOptions
-from surrogate.verbs.outputs import TRAJECTORY_SUFFIXES, check_outputs, join_replicas, summarised_outputs
-from surrogate.verbs.scene_listing import prepare_scene
+from surrogate.verbs.options import RolloutOptions, tell
+from surrogate.verbs.outputs import check_outputs, join_replicas, summarised_outputs
+from surrogate.verbs.scenes import prepare_scene
 from systems.options import options_as_keywords, part_of
+from systems.trajectory.codec import WRITTEN
 
 if TYPE_CHECKING:
     from systems.scene import Scene
@@ -48,7 +48,7 @@ def rollout(
 
     outs = replica_paths(Path(out), options.replicas)
     joined = [Path(out)] if options.join and len(outs) > 1 else []
-    check_outputs([*outs, *joined], TRAJECTORY_SUFFIXES, resume=options.resume, overwrite=options.overwrite)
+    check_outputs([*outs, *joined], WRITTEN, resume=options.resume, overwrite=options.overwrite)
     file = None if weights is None else weights_path(weights)
     molecule = prepare_scene(scene, options, quiet=options.quiet)
 

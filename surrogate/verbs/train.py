@@ -1,7 +1,9 @@
-"""The verb `train`: an architecture and settings that suit the references, then the training and its verdict."""
+"""The verbs `windows` and `train`: training data in one file; an architecture and settings that suit the references,
+or a potential of one molecule at an expensive level of theory, then the training and its verdict."""
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, replace
@@ -10,17 +12,44 @@ from typing import TYPE_CHECKING
 
 from surrogate.models.architecture import architecture, names, weights_path
 from surrogate.progress import progress_bar
-from surrogate.verbs.learn_molecule import learn_molecule
-from surrogate.verbs.messages import tell
-from surrogate.verbs.options import PathLike, TrainOptions, Trajectories
+from surrogate.verbs.options import PathLike, TrainOptions, Trajectories, WindowsOptions, tell
 from surrogate.verbs.outputs import check_outputs, find_trajectories
+from surrogate.verbs.scenes import prepare_scene
 from systems.errors import InputError
 from systems.files.whole_file import OutputLock
-from systems.options import options_as_keywords
+from systems.options import Preparation, options_as_keywords
+from systems.scene import Scene
 
 if TYPE_CHECKING:
     from surrogate.data import References
     from surrogate.models.architecture import Choice, Trainer, TrainingRequest
+
+
+POTENTIAL = "painet-potential"
+
+
+@options_as_keywords(WindowsOptions)
+def windows(references: Trajectories, out: PathLike, options: WindowsOptions) -> Path:
+    """Read reference trajectories of one scene, canonicalise them once, and write one compact file for training.
+
+    They may be larger than memory. `validation`: trajectories held out whole; without any, the last twentieth of each
+    is. `velocities` keeps these as well, for PAINET, and leaves frames in their own pose. Raises InputError when
+    scenes, save intervals or conditions differ, TrajectoryError for damaged files.
+    """
+    from surrogate.data import load_frames, write_windows
+
+    out = Path(out)
+    check_outputs([out], [".h5"], overwrite=options.overwrite)
+    paths = find_trajectories(references, verify=True)
+    held = [] if options.validation is None else find_trajectories(options.validation, verify=True)
+    canonical = options.canonical and not options.velocities
+    write_windows(paths, out, canonical=canonical, velocities=options.velocities, held=held)
+    try:
+        load_frames(out).refuse_leaks()
+    except InputError:
+        out.unlink()
+        raise
+    return out
 
 
 @dataclass(frozen=True)
@@ -66,7 +95,7 @@ def train(references: Trajectories, out: PathLike, options: TrainOptions) -> Pat
     out = Path(out)
     asked = _asked(options, out)
     if asked.arch and options.level is None:
-        _trainer(asked.arch).check(asked)
+        architecture(asked.arch).trainer().check(asked)
     check_outputs([out], [".safetensors"], resume=options.resume, overwrite=options.overwrite)
     states = sorted(out.parent.glob(f"{out.stem}.*.train.safetensors"))
     if states and not (options.resume or options.overwrite):
@@ -80,9 +109,9 @@ def train(references: Trajectories, out: PathLike, options: TrainOptions) -> Pat
             written = learn_molecule(references, asked, options, _shown(bar))
         _conclude(written, fitted=False, quiet=options.quiet)
         return written
-    plan = _plan(references, options.validation, replace(asked, device=_device(options.device)))
-    from surrogate.training.devices import is_first_process
+    from surrogate.training.devices import choose_device, is_first_process
 
+    plan = _plan(references, options.validation, replace(asked, device=choose_device(options.device)))
     first, quiet = is_first_process(), options.quiet
     prepared = plan.trainer.prepare(plan.references, plan.request)
     if first and not quiet:
@@ -97,7 +126,7 @@ def train(references: Trajectories, out: PathLike, options: TrainOptions) -> Pat
 
 
 def _shown(bar: Callable[..., None] | None) -> Callable[[str, float], None]:
-    """Return what a training tells its stage and share to."""
+    """Return what a training reports its stage and share to."""
 
     def advance(stage: str, share: float) -> None:
         if bar is not None:
@@ -149,32 +178,16 @@ def _asked(options: TrainOptions, out: Path) -> TrainingRequest:
     )
 
 
-def _check_start(request: TrainingRequest) -> None:
-    """Raise InputError for weights to go on from that are of another architecture."""
-    from surrogate.models.weights import read_header
-
-    if request.start_from is not None and (found := read_header(request.start_from).arch) != request.arch:
-        raise InputError(f"{request.start_from} holds {found}, not {request.arch}.")
-
-
-def _trainer(name: str) -> Trainer:
-    trainer: Trainer = architecture(name).trainer()
-    return trainer
-
-
-def _device(name: str) -> str:
-    from surrogate.training.devices import choose_device
-
-    return choose_device(name)
-
-
 def _plan(references: Trajectories, validation: Trajectories | None, asked: TrainingRequest, *,
           explained: bool = False) -> _Plan:  # fmt: skip
     """Find the references and choose what is not asked for."""
     from surrogate.data import References
 
-    if asked.arch:
-        _check_start(asked)
+    if asked.arch and asked.start_from is not None:
+        from surrogate.models.weights import read_header
+
+        if (found_arch := read_header(asked.start_from).arch) != asked.arch:
+            raise InputError(f"{asked.start_from} holds {found_arch}, not {asked.arch}.")
     paths = find_trajectories(references, verify=True)
     held = [] if validation is None else find_trajectories(validation, verify=True)
     found = References(tuple(paths), tuple(held), spool=asked.out.parent)
@@ -182,7 +195,7 @@ def _plan(references: Trajectories, validation: Trajectories | None, asked: Trai
     if not asked.arch:
         name, why = _suited(found)
         asked = replace(asked, arch=name)
-    trainer = _trainer(asked.arch)
+    trainer: Trainer = architecture(asked.arch).trainer()
     if not explained:
         trainer.check(asked)
     choices = trainer.choose(found, asked)
@@ -235,3 +248,56 @@ def _conclude(written: Path, *, fitted: bool, quiet: bool) -> None:
     if not quiet:
         for line in verdict.lines():
             tell(written.name, line)
+
+
+# ---- one molecule ----------------------------------------------------------------------------------------------------
+
+
+def learn_molecule(
+    given: Trajectories | Scene, request: TrainingRequest, options: TrainOptions, advance: Callable[[str, float], None]
+) -> Path:
+    """Learn the molecule that `given` names from `options.level` and return the weights.
+
+    The budget is of wall time for all of it: the molecule's preparation, answers, steps, and the verdict that the
+    caller comes to (`train_verdict.compare_training`). Raises InputError for what means nothing here, PreparationError
+    for what the level of theory refuses.
+    """
+    began = time.monotonic()
+    from md_reference.forces.spec import QUANTUM, at_level
+
+    if at_level(options.level, None) != QUANTUM:
+        raise InputError(
+            f"a level is worth learning where it is expensive; use `level='{QUANTUM}'`, or a reference of MD."
+        )
+    if request.arch not in ("", "painet", POTENTIAL):
+        raise InputError(f"{request.arch} learns from trajectories; use `arch='painet'`, or leave `level` out.")
+    unknown = {"`start_from`": options.start_from, "`longest_lag_ps`": options.longest_lag_ps,
+               "`validation`": options.validation}  # fmt: skip
+    if given_too := [name for name, value in unknown.items() if value is not None]:
+        raise InputError(f"{', '.join(given_too)}: a potential learns from states that it asks about; leave it out.")
+    if request.budget_s is None and request.steps is None:
+        raise InputError("say how long to train: `budget_s='30min'` or `steps=10000`.")
+    if not isinstance(given, str | Path | Scene):
+        named = list(given)
+        if len(named) != 1:
+            raise InputError(f"one molecule a model: {len(named)} are given.")
+        given = named[0]
+    scene = prepare_scene(given, Preparation(), quiet=options.quiet)
+
+    from md_reference.run.labeller import Labeller
+    from surrogate.models.painet.energy import PainetPotential
+    from surrogate.models.painet.potential_trainer import PotentialTrainer
+    from surrogate.verbs.train_verdict import trial_s
+
+    trainer: PotentialTrainer = architecture(POTENTIAL).trainer()
+    config = trainer.settings(request).model  # what is wrong with it is known before anything is computed
+    with Labeller(scene) as reference:
+        if not options.quiet:
+            tell(request.out.name, f"{scene.name} ({scene.formula}) by {QUANTUM}; weights know this molecule alone")
+        after_s = trial_s(PainetPotential(config), scene)
+        out = trainer.learn(reference, request, advance, before_s=time.monotonic() - began, after_s=after_s)
+        if reference.n_rearranged and not options.quiet:
+            tell(
+                out.name, f"{reference.n_rearranged} states left out: they are another molecule, by bonds or handedness"
+            )
+        return out

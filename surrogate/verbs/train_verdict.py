@@ -6,17 +6,20 @@ import json
 import statistics
 import tempfile
 import time
-from dataclasses import asdict, dataclass
+from collections import Counter
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from systems.errors import SimulationError, SurromdError
+import numpy as np
+
+from systems.errors import SurromdError
 from systems.files.whole_file import create_whole
 from systems.units import format_time_ps
 
 if TYPE_CHECKING:
     from surrogate.models.potential import Potential
-    from surrogate.models.weights import TrainingDomain, Weights
+    from surrogate.models.weights import Weights
     from systems.scene import Scene
 
 # Frames that pass the guards, in per cent: from the first on the weights can be rolled as they are, from the second on
@@ -52,31 +55,25 @@ class TrainingVerdict:
     def lines(self) -> list[str]:
         """Return it for people."""
         done = ", ".join(f"{name} {steps} steps" for name, steps in self.steps.items())
-        errors = ", ".join(
-            f"{column.removeprefix('validation_')} {value:.3g}"
-            for columns in self.validation.values()
-            for column, value in columns.items()
-        )
-        wrong = ", ".join(f"{name} ({n})" for name, n in self.reasons.items())
-        found = f"{self.percent_valid:.3g} % of {self.n_frames} frames pass the guards"
-        lines = [f"trained: {done}; validation error: {errors}"]
-        lines.append(
-            f"rolled {format_time_ps(self.rolled_ps)} without help: {found}{f'; the others: {wrong}' if wrong else ''}"
-        )
+        last = [each for columns in self.validation.values() for each in columns.items()]
+        errors = ", ".join(f"{column.removeprefix('validation_')} {value:.3g}" for column, value in last)
+        wrong = "; the others: " * bool(self.reasons) + ", ".join(f"{name} ({n})" for name, n in self.reasons.items())
+        found = f"{self.percent_valid:.3g} % of {self.n_frames} frames pass the guards{wrong}"
+        lines = [
+            f"trained: {done}; validation error: {errors}",
+            f"rolled {format_time_ps(self.rolled_ps)} without help: {found}",
+        ]
         if self.stopped:
             lines.append(f"the rollout stopped: {self.stopped}")
         if self.word == "usable":
-            lines.append("usable; whether populations and time scales are right, `surromd compare` with MD tells")
-            return lines
+            return [*lines, "usable; whether populations and time scales are right, `surromd compare` with MD shows"]
         help_ = "usable with `guard='repair'` or resample alone" if self.word != "not usable" else "not usable as it is"
         return [*lines, f"{help_}; what would help: {'; '.join(self.advice)}"]
 
 
 def compare_training(path: Path) -> TrainingVerdict:
-    """Roll freshly trained weights from the structures they know, and say what they are good for.
-
-    Draws each chunk once, so that the share of frames that pass is the network's own. Raises WeightsError, InputError.
-    """
+    """Roll freshly trained weights from the structures they know, and say what they are good for. Draws each chunk
+    once, so that the share of frames that pass is the network's own. Raises WeightsError, InputError."""
     from surrogate.models.weights import load_weights
     from surrogate.training.loop import read_curves, series
 
@@ -96,10 +93,10 @@ def compare_training(path: Path) -> TrainingVerdict:
         rolled_ps=rolled.time_ps,
         n_frames=rolled.n_frames,
         percent_valid=valid,
-        reasons=dict(sorted(rolled.reasons.items(), key=lambda item: -item[1])),
+        reasons=dict(rolled.reasons.most_common()),
         stopped=rolled.stopped,
         word=word,
-        advice=() if word == "usable" else tuple(_advice(weights, stages, rolled)),
+        advice=() if word == "usable" else tuple(_advice(weights, stages)),
     )
 
 
@@ -125,12 +122,7 @@ def trial_s(model: Potential, scene: Scene) -> float:
 def write_verdict(path: Path, verdict: TrainingVerdict) -> Path:
     """Write NAME.verdict.json beside the weights `path` and return it."""
     out = path.with_suffix(".verdict.json")
-    text = json.dumps(asdict(verdict), indent=1) + "\n"
-
-    def fill(temporary: Path) -> None:
-        temporary.write_text(text, "utf-8")
-
-    create_whole(out, fill)
+    create_whole(out, json.dumps(asdict(verdict), indent=1) + "\n")
     return out
 
 
@@ -143,81 +135,64 @@ def word_of(percent_valid: float, stopped: str = "") -> str:
 
 @dataclass
 class _Rolled:
+    """Frames that were rolled, how many of them the guards caught and why, and what stopped the rollout."""
+
     time_ps: float = 0.0
     n_frames: int = 0
     n_caught: int = 0
-    # Bonds more than 20 % off, and how many of them hold a hydrogen.
     stopped: str = ""
-
-    def __post_init__(self) -> None:
-        self.reasons: dict[str, int] = {}
+    reasons: Counter[str] = field(default_factory=Counter)
 
 
 def _roll(weights: Weights) -> _Rolled:
     """Roll up to six of the molecules trained on, four replicas of six chunks each."""
+    from surrogate.sampling.chunks import caught
     from surrogate.sampling.runner import RolloutConfig, rollout
+    from systems.chemistry.validity import flag_names
+    from systems.trajectory.codec import open_trajectory
 
     members, found = weights.domain.members, _Rolled()
     for domain in members[:: -(-len(members) // _MOLECULES)]:
         time_ps = _CHUNKS * weights.model.n_new * weights.domain.lag_ps
+        lag_ps = weights.domain.lag_ps if weights.domain.jumps else None
         with tempfile.TemporaryDirectory(prefix="surromd-verdict-") as folder:
             outs = [Path(folder) / f"r{k}.h5" for k in range(_REPLICAS)]
-            config = RolloutConfig(time_ps=time_ps, lag_ps=weights.domain.lag_ps if weights.domain.jumps else None,
-                                   seed=_SEED)  # fmt: skip
             try:
-                rollout(domain.scene, weights, outs, config)
-            except SimulationError as error:
+                rollout(domain.scene, weights, outs, RolloutConfig(time_ps=time_ps, lag_ps=lag_ps, seed=_SEED))
+            except SurromdError as error:  # also a structure that the checks of its own reference do not pass
                 found.stopped = found.stopped or str(error).split(";")[0]
-            except SurromdError as error:
-                # Such as a structure that the checks of its own reference do not pass.
-                found.stopped = found.stopped or str(error)
-            for out in outs:
-                if out.exists():
-                    _count(found, out, domain)
+            for out in filter(Path.exists, outs):
+                with open_trajectory(out) as reader:
+                    flags = np.zeros(0, np.uint16) if reader.flags is None else np.asarray(reader.flags, np.uint16)
+                wrong = flags[caught(flags)]
+                found.n_frames += len(flags)
+                found.time_ps += len(flags) * domain.lag_ps
+                found.n_caught += len(wrong)
+                found.reasons.update(name for bits in wrong.tolist() for name in flag_names(bits))
     return found
 
 
-def _count(found: _Rolled, path: Path, domain: TrainingDomain) -> None:
-    import numpy as np
-
-    from surrogate.sampling.chunks import caught
-    from systems.chemistry.validity import flag_names
-    from systems.trajectory.codec import open_trajectory
-
-    with open_trajectory(path) as reader:
-        if not reader.n_frames or reader.flags is None:
-            return
-        flags = np.asarray(reader.flags).astype(np.uint16)
-    found.n_frames += len(flags)
-    found.time_ps += len(flags) * domain.lag_ps
-    found.n_caught += int(caught(flags).sum())
-    for bits in flags[caught(flags)].tolist():
-        for name in flag_names(bits):
-            found.reasons[name] = found.reasons.get(name, 0) + 1
-
-
-def _advice(weights: Weights, stages: dict[str, list[dict[str, str]]], rolled: _Rolled) -> list[str]:
+def _advice(weights: Weights, stages: dict[str, list[dict[str, str]]]) -> list[str]:
     """Return what would help, what is likeliest first."""
+    from surrogate.models.potential import Potential
     from surrogate.training.loop import series
 
     found = _nearer_weights(weights)
-    n_frames = sum(int(source.get("n_frames", 0)) for source in weights.provenance.get("sources", ()))
-    from surrogate.models.potential import Potential
-
-    if isinstance(weights.model, Potential):
-        n_frames = 0  # it learned from states, which need be no MD
+    # A potential learned from states, which need be no MD.
+    sources = [] if isinstance(weights.model, Potential) else weights.provenance.get("sources", ())
+    n_frames = sum(int(source.get("n_frames", 0)) for source in sources)
     rows = list(stages.values())[-1] if stages else []
     column = next((c for c in (rows[-1] if rows else {}) if c.startswith("validation_")), "")
-    values = series(rows, column)[1] if column else []
+    values, trained = (
+        series(rows, column.replace("validation_", kind))[1] if column else [] for kind in ("validation_", "train_")
+    )
     if len(values) < 4 or values[-1] < (1.0 - _STILL_FALLS) * values[len(values) // 2]:
         found.append("more minutes (`budget_s`): the validation error had not settled")
-    trained = series(rows, column.replace("validation_", "train_"))[1] if column else []
-    by_heart = bool(values and trained and values[-1] > _BY_HEART * trained[-1])
-    if by_heart or 0 < n_frames < _FEW_FRAMES:
-        why = f"{n_frames} frames are few"
-        if by_heart:
-            why = f"the validation error is {values[-1] / trained[-1]:.2g} times that in training"
-        found.append(f"more reference MD: {why}")
+    if values and trained and values[-1] > _BY_HEART * trained[-1]:
+        times = values[-1] / trained[-1]
+        found.append(f"more reference MD: the validation error is {times:.2g} times that in training")
+    elif 0 < n_frames < _FEW_FRAMES:
+        found.append(f"more reference MD: {n_frames} frames are few")
     return found or ["more minutes (`budget_s`) and more reference MD"]
 
 
@@ -234,8 +209,7 @@ def _nearer_weights(weights: Weights) -> list[str]:
         header = read_header(path)
         domain = header.domain
         same = all(domain.conditions.get(key) == own.conditions.get(key) for key in ("force_field", "solvent"))
-        if header.arch != weights.model.arch or not same or domain.lag_ps != own.lag_ps:
-            continue
-        if not any(find_deviations(member.scene, domain) for member in own.members):
+        same = same and header.arch == weights.model.arch and domain.lag_ps == own.lag_ps
+        if same and not any(find_deviations(member.scene, domain) for member in own.members):
             return [f"to go on from weights that know such molecules (`start_from='{name}'`), or to roll those"]
     return []

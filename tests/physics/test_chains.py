@@ -14,10 +14,10 @@ import pytest
 from energies import energy_terms
 from md_reference.forces import nonstandard
 from md_reference.forces.forcefield import build_system, resolve
-from md_reference.forces.regrouping import regroup
-from md_reference.forces.residue_templates import cap, make_template
-from md_reference.forces.small_molecules.gaff import POWER, SECONDS_AT_30_ATOMS, announced, expected_s
-from md_reference.forces.small_molecules.programs import find_ambertools, run
+from md_reference.forces.gaff import POWER, SECONDS_AT_30_ATOMS, announced, expected_s
+from md_reference.forces.mixture import regroup
+from md_reference.forces.nonstandard import cap, make_template
+from md_reference.forces.programs import find_ambertools, run
 from md_reference.forces.spec import ForceFieldSpec
 from md_reference.forces.templates import glycan_templates
 from systems.chemistry.bond_orders import perceive
@@ -101,9 +101,9 @@ def test_a_template_gives_each_term_of_the_molecule_it_was_made_of(name: str) ->
     from openmm import app
 
     scene = load(name)
-    template = make_template(cap(scene, 0), "MOL-1")
-    assert template.spread_e == pytest.approx(0.0, abs=1e-6)
-    ours = app.ForceField(io.StringIO(template.xml)).createSystem(scene.to_openmm_topology(), removeCMMotion=False)
+    template, spread_e = make_template(cap(scene, 0), "MOL-1")
+    assert spread_e == pytest.approx(0.0, abs=1e-6)
+    ours = app.ForceField(io.StringIO(template)).createSystem(scene.to_openmm_topology(), removeCMMotion=False)
     x = scene.positions_nm + 0.005 * np.random.default_rng(0).normal(size=scene.positions_nm.shape)
     theirs = energy_terms(build_system(scene, ForceFieldSpec("gaff2", "vacuum", None, False)), x)
     for force, energy in energy_terms(ours, x).items():
@@ -184,8 +184,8 @@ def test_a_missing_term_is_refused(aib_chain: Any, monkeypatch: pytest.MonkeyPat
     from md_reference.forces import nonstandard as module
 
     def with_a_hole(capped: Any, name: str) -> Any:
-        made = make_template(capped, name)
-        return replace(made, xml=re.sub(r"<Angle [^>]*/>", "", made.xml, count=1))
+        xml, spread_e = make_template(capped, name)
+        return re.sub(r"<Angle [^>]*/>", "", xml, count=1), spread_e
 
     monkeypatch.setattr(module, "make_template", with_a_hole)
     with pytest.raises(PreparationError, match=r"no parameters for .* angles"):

@@ -26,7 +26,7 @@ def test_shipped_parameters_run_and_what_gaff2_lacks_is_refused(name: str) -> No
 @pytest.mark.slow
 @pytest.mark.parametrize("case", cases(), ids=lambda c: c.name)
 def test_each_runs_or_says_why_not(case: Case) -> None:
-    from md_reference.forces.small_molecules.programs import find_ambertools
+    from md_reference.forces.programs import find_ambertools
 
     if find_ambertools() is None:
         pytest.skip("needs AmberTools")

@@ -12,6 +12,7 @@ from md_reference.forces.forcefield import build_system
 from md_reference.forces.spec import ForceFieldSpec
 from md_reference.run.config import Conditions
 from md_reference.run.engine import Engine
+from surrogate.bench.timing import plain_system
 from systems.errors import PreparationError, UnknownNameError
 from systems.library.named_scenes import prepare
 from systems.scene import FloatArray, Scene
@@ -79,7 +80,7 @@ def force_of(system: Any, kind: str) -> Any:
 @pytest.mark.parametrize("force_field", ["ff14SB", "ff99SB-ILDN"])
 def test_native_obc2_equals_the_custom_force(name: str, force_field: str) -> None:
     scene, spec = scene_of(name), ForceFieldSpec(force_field, "obc2")
-    native, custom = build_system(scene, spec), build_system(scene, spec, native_gb=False)
+    native, custom = build_system(scene, spec), plain_system(scene, spec)
     assert force_of(native, "GBSAOBCForce").getNumParticles() == scene.n_atoms
     assert force_of(custom, "CustomGBForce").getNumParticles() == scene.n_atoms
     energy_gap, force_gap = largest_gaps(native, custom, thermal_geometries(name))
@@ -91,7 +92,7 @@ def test_native_obc2_equals_the_custom_force(name: str, force_field: str) -> Non
 def test_the_comparison_notices_one_wrong_parameter(changed: str) -> None:
     name = "alanine-dipeptide"
     scene, spec = scene_of(name), ForceFieldSpec("ff14SB", "obc2")
-    native, custom = build_system(scene, spec), build_system(scene, spec, native_gb=False)
+    native, custom = build_system(scene, spec), plain_system(scene, spec)
     force = force_of(native, "GBSAOBCForce")
     oxygen = scene.elements.index("O")
     charge, radius, scale = force.getParticleParameters(oxygen)

@@ -14,10 +14,10 @@ import numpy as np
 import pytest
 
 from energies import energy_terms
+from md_reference.forces import gaff
 from md_reference.forces.forcefield import build_system
-from md_reference.forces.small_molecules import gaff
-from md_reference.forces.small_molecules.prmtop import Prmtop, load_openmm
-from md_reference.forces.small_molecules.programs import find_ambertools
+from md_reference.forces.gaff import Prmtop, load_openmm
+from md_reference.forces.programs import find_ambertools
 from md_reference.forces.spec import ForceFieldSpec
 from systems.errors import PreparationError
 from systems.prepare.molecule import scene_from_smiles
@@ -127,17 +127,6 @@ def test_born_energy_equals_sanders(solvent: str, igb: int, radii: str, cache_ho
     assert abs(theirs) > 100.0
 
 
-@needs_ambertools
-def test_native_and_custom_obc2_agree_for_gaff_molecules(cache_home: Path) -> None:
-    scene = scene_of("acetamide")
-    x, spec = distorted(scene), ForceFieldSpec("gaff2", "obc2", None, False)
-    native, custom = (
-        energy_terms(build_system(scene, spec), x),
-        energy_terms(build_system(scene, spec, native_gb=False), x),
-    )
-    assert native["GBSAOBCForce"] == pytest.approx(custom["CustomGBForce"], abs=1e-3)
-
-
 # ---- atom order and cache --------------------------------------------------------------------------------------------
 
 
@@ -182,7 +171,7 @@ def test_the_first_of_two_writers_stays(tmp_path: Path, alanine_dipeptide: Scene
     from systems.library.named_scenes import load
 
     scene = load("ethanol")
-    found = gaff.find_shipped(scene, gaff.METHOD)
+    found = gaff.read_entry(gaff.shipped_path(scene))
     assert found is not None
     path = tmp_path / "entry.json.gz"
     first = gaff.store(path, replace(found, source={"who": "first"}))
@@ -195,7 +184,7 @@ def test_shipped_parameters_need_no_ambertools(monkeypatch: pytest.MonkeyPatch, 
     from systems.library.named_scenes import load
 
     monkeypatch.setattr(gaff, "find_ambertools", lambda: None)
-    monkeypatch.setattr("md_reference.forces.small_molecules.programs.find_ambertools", lambda: None)
+    monkeypatch.setattr("md_reference.forces.programs.find_ambertools", lambda: None)
     monkeypatch.setenv("SURROMD_CACHE", str(tmp_path))
     scene = load("aspirin")
     assert Prmtop(gaff.parameters(scene)).n_atoms == scene.n_atoms

@@ -12,7 +12,7 @@ import pytest
 
 from energies import energy_terms
 from md_reference.forces.forcefield import build_system
-from md_reference.forces.small_molecules.programs import find_ambertools, run
+from md_reference.forces.programs import find_ambertools, run
 from md_reference.forces.spec import ForceFieldSpec
 from systems.library.named_scenes import load, prepare
 from systems.scene import FloatArray, Scene

@@ -16,8 +16,7 @@ from md_reference.forces.forcefield import resolve
 from md_reference.forces.quantum import KJ_MOL_PER_HARTREE, NM_PER_BOHR, Potential, build_quantum_system
 from md_reference.forces.spec import ForceFieldSpec, at_level
 from md_reference.run.config import Conditions, resolve_settings
-from md_reference.run.engine import Engine
-from md_reference.run.frame_relaxation import Relaxer
+from md_reference.run.engine import Engine, Relaxer
 from systems.errors import InputError, PreparationError, UnknownNameError
 from systems.library.named_scenes import load
 from systems.prepare.molecule import scene_from_smiles

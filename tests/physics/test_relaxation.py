@@ -10,8 +10,7 @@ import pytest
 from md_reference.forces.forcefield import build_system
 from md_reference.forces.spec import ForceFieldSpec
 from md_reference.run.config import Conditions
-from md_reference.run.engine import Engine
-from md_reference.run.frame_relaxation import Relaxer
+from md_reference.run.engine import Engine, Relaxer
 from systems.errors import SimulationError
 from systems.scene import Scene
 

@@ -20,7 +20,7 @@ from md_reference.campaign.manifest import campaign_trajectories, read_manifest,
 from md_reference.campaign.scheduler import check_same_campaign, new_manifest
 from md_reference.campaign.worker import PreparedScene, load_prepared
 from md_reference.forces.forcefield import ForceFieldSpec, build_system
-from md_reference.run.platforms import PlatformChoice
+from md_reference.run.machine import PlatformChoice
 from md_reference.run.simulate import MDConfig, simulate
 from surrogate import api
 from surrogate.cli.render import print_pairs

@@ -8,8 +8,6 @@ from pathlib import Path
 import md_speed as study
 import pytest
 
-from surrogate.bench.plain_openmm import plain
-
 
 def test_the_benchmark_compares_equal_models(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "bench.json"
@@ -35,5 +33,5 @@ def test_unequal_models_are_seen() -> None:
     mine = study.ours(ala, scene, cores=1)
     mine.context.setPositions(scene.positions_nm)
     for other in (ala, study.Case("x", ala.scene, "vacuum"), study.Case("x", ala.scene, "obc2", "ff99SB-ILDN")):
-        found = study._compare({"ours": mine, "plain, one a core": plain(scene, other.spec(), threads=1)})
+        found = study._compare({"ours": mine, "plain, one a core": study.plain(scene, other.spec(), threads=1)})
         assert found["equal_energies"] == (other is ala), found

@@ -14,8 +14,8 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
-from surrogate.cli.flags import as_flags
 from surrogate.cli.parameters import with_options
+from surrogate.cli.render import as_flags
 from systems.errors import InputError, UnitError, UnknownNameError
 from systems.options import (
     MissingOptionError,

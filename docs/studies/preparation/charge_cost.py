@@ -2,7 +2,7 @@
 
     python docs/studies/preparation/charge_cost.py [--largest 90]
 
-Prints a row for each molecule and the law that stands in `md_reference/forces/small_molecules/gaff.py`.
+Prints a row for each molecule and the law that stands in `md_reference/forces/gaff.py`.
 Processor time of the children is counted, so that a busy machine changes little. Needs AmberTools; nothing is cached.
 """
 
@@ -14,7 +14,7 @@ import sys
 
 import numpy as np
 
-from md_reference.forces.small_molecules import gaff
+from md_reference.forces import gaff
 from systems.prepare.molecule import scene_from_smiles
 
 SMILES = {

@@ -151,7 +151,7 @@ def _forces(scene: Any, charges: bool) -> tuple[str, str, float | None]:
     import openmm
 
     from md_reference.forces.forcefield import build_system
-    from md_reference.forces.small_molecules.programs import find_ambertools
+    from md_reference.forces.programs import find_ambertools
     from md_reference.forces.spec import ForceFieldSpec
     from systems.errors import SurromdError
 

@@ -19,7 +19,7 @@ from systems.trajectory.companion_writer import pdb_text
 
 def make(entry: Entry) -> list[Path]:
     """Write the structure of one entry and, for a molecule, its parameters; return what is new."""
-    from md_reference.forces.small_molecules.gaff import write_shipped
+    from md_reference.forces import gaff
     from systems.library.named_scenes import load
 
     written = []
@@ -28,7 +28,11 @@ def make(entry: Entry) -> list[Path]:
         path.write_text(pdb_text(replace(_scene(entry), name=entry.name)))
         written.append(path)
     if entry.smiles:
-        written.append(write_shipped(load(entry.name)))
+        scene = load(entry.name)
+        made, parameters = gaff.entry(scene, cached=False), gaff.shipped_path(scene)
+        parameters.unlink(missing_ok=True)
+        gaff.store(parameters, made)
+        written.append(parameters)
     return written
 
 

@@ -25,7 +25,7 @@ import torch
 import surrogate as sm
 from md_reference.forces.quantum import Potential
 from md_reference.run.machine import machine_name
-from surrogate.bench.stress.frame_statistics import HALF_ANGSTROM_RULE
+from surrogate.bench.stress_page import HALF_ANGSTROM_RULE
 from surrogate.models.painet.potential_trainer import Samples, samples_path
 from surrogate.models.propagator import Molecule
 from surrogate.models.weights import load_weights

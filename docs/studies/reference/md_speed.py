@@ -27,10 +27,8 @@ import numpy as np
 from md_reference.forces.forcefield import build_system, resolve
 from md_reference.forces.spec import ForceFieldSpec, WaterBox
 from md_reference.run.config import Conditions
-from md_reference.run.machine import available_cores, platform_properties
-from md_reference.run.platforms import measured_platform
-from surrogate.bench.machine import machine_facts
-from surrogate.bench.plain_openmm import FRICTION_PER_PS, TEMPERATURE_K, TIMESTEP_PS, Setup, plain
+from md_reference.run.machine import available_cores, measured_platform, platform_properties
+from surrogate.bench.timing import machine_facts, plain_context
 from systems.errors import InputError, SimulationError, SurromdError, first_line, nearest
 from systems.files.whole_file import create_whole
 from systems.interrupts import end_with_parent
@@ -38,6 +36,7 @@ from systems.scene import Scene
 from systems.units import parse_wall_s
 
 LONG_TIMESTEP_PS, HYDROGEN_MASS_DA = 0.004, 3.0
+TEMPERATURE_K, FRICTION_PER_PS, TIMESTEP_PS = 300.0, 1.0, 0.002  # of `plain_context`, too
 
 MODES = ("ours", "plain, all cores", "plain, one a core", "ours, 4 fs and 3 Da")
 _OURS, _ALL_CORES, _PER_CORE, _LONG = MODES
@@ -109,6 +108,25 @@ class Row:
     energy_gap: float
     force_gap: float
     equal_energies: bool
+
+
+@dataclass(frozen=True)
+class Setup:
+    """A Context ready to run, and in words what it is."""
+
+    context: Any
+    platform: str
+    threads: str
+    timestep_ps: float
+
+
+def plain(scene: Scene, spec: ForceFieldSpec, *, threads: int | None) -> Setup:
+    """Return what OpenMM's manual makes of the model, and what it runs on."""
+    context = plain_context(scene, spec, threads=threads)
+    platform = context.getPlatform()
+    is_cpu = platform.getName() == "CPU"
+    used = platform.getPropertyValue(context, "Threads") if is_cpu else "1"
+    return Setup(context, platform.getName(), used, TIMESTEP_PS)
 
 
 def ours(case: Case, scene: Scene, *, cores: int, repartitioned: bool = False) -> Setup:

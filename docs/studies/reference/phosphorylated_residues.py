@@ -17,7 +17,7 @@ from collections import defaultdict
 from pathlib import Path
 from xml.etree import ElementTree
 
-from md_reference.forces.small_molecules.programs import ambertools, gaff2_table
+from md_reference.forces.programs import ambertools
 
 KCAL = 4.184
 # Columns that the types of a term take.
@@ -39,7 +39,7 @@ def main() -> None:
     default = Path(__file__).parents[3] / "systems" / "library" / "data" / "phosaa14SB.xml"
     parser.add_argument("--output", type=Path, default=default)
     output = parser.parse_args().output
-    tables = gaff2_table().parent
+    tables = ambertools().gaff2_table.parent
     sections = read_frcmod((tables / "frcmod.phosaa14SB").read_text())
     library = (tables.parent / "lib" / "phosaa14SB.lib").read_text()
     for section, rows in PARM10.items():

@@ -19,12 +19,10 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
-from surrogate.bench.cost_error.effective_samples import samples_per_second
-from surrogate.bench.cost_error.paired_timing import roll_in_turns
-from surrogate.bench.cost_error.sweep_settings import CostErrorConfig, Setting
-from surrogate.bench.held_out import refuse_trained_on
-from surrogate.bench.machine import machine_facts
-from surrogate.bench.rolling import Roller
+from surrogate.bench.accuracy import samples_per_second
+from surrogate.bench.bench_options import CostErrorConfig, Setting
+from surrogate.bench.cost_error import refuse_trained_on
+from surrogate.bench.timing import Roller, machine_facts, roll_in_turns
 from surrogate.comparison.measure.distributions import RAMACHANDRAN_BINS, distance, is_positive
 from surrogate.models.architecture import weights_path
 from surrogate.models.weights import load_weights

@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from surrogate.bench.machine import machine_facts
+from surrogate.bench.timing import machine_facts
 from surrogate.models.architecture import weights_path
 from surrogate.models.lam_slide.model import LamSlide
 from surrogate.models.propagator import draw_noise

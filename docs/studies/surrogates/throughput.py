@@ -28,7 +28,7 @@ from plain_network import plain_network
 from torch import Tensor
 from torch.utils.flop_counter import FlopCounterMode
 
-from surrogate.bench.machine import machine_facts
+from surrogate.bench.timing import machine_facts
 from surrogate.models.architecture import weights_path
 from surrogate.models.lam_slide import flow
 from surrogate.models.lam_slide.model import Approximator, ApproximatorConfig, LamSlide

@@ -23,8 +23,7 @@ from drug_like_states import read_list
 from safetensors.torch import load_file, save_file
 from torch import Tensor
 
-from surrogate.models.painet.potential.energy import NO_WALL_NM, Fabric, PotentialConfig
-from surrogate.models.painet.potential.model import PainetPotential
+from surrogate.models.painet.energy import NO_WALL_NM, Fabric, PainetPotential, PotentialConfig
 from surrogate.models.propagator import Molecule
 from surrogate.training.devices import torch_threads
 from surrogate.training.loop import Stage, StageConfig, train_stages

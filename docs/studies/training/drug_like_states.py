@@ -29,19 +29,17 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from md_reference.forces.gaff import load_openmm, rough_parameters
 from md_reference.forces.quantum import Potential
-from md_reference.forces.small_molecules.gaff import rough_parameters
-from md_reference.forces.small_molecules.prmtop import load_openmm
 from md_reference.forces.spec import ForceFieldSpec
 from md_reference.run.config import Conditions
 from md_reference.run.engine import Engine
 from systems.chemistry.distance_bonds import changed_bond
-from systems.chemistry.geometry_rules import changed_stereo
 from systems.chemistry.graph import bonded_graph, turn_torsions
+from systems.chemistry.validity import changed_stereo
 from systems.errors import PreparationError, SurromdError
 from systems.files.whole_file import create_whole
 from systems.library.named_scenes import prepare
-from systems.prepare.molecule import to_rdkit
 from systems.scene import ATOMIC_NUMBERS, Scene
 
 FloatArray = npt.NDArray[np.float64]
@@ -143,12 +141,13 @@ def read_list(path: Path = LIST) -> list[Entry]:
     ]
 
 
-def states_of(scene: Scene, n: int, seed: int) -> FloatArray:
+def states_of(scene: Scene, smiles: str, n: int, seed: int) -> FloatArray:
     """Return states `(n, n_atoms, 3)` nm of a molecule, before any of them is asked about."""
+    from rdkit import Chem
     from rdkit.Chem import AllChem
 
     rng = np.random.default_rng(seed)
-    molecule = to_rdkit(scene)
+    molecule = Chem.AddHs(Chem.MolFromSmiles(smiles))  # its atoms are in the order of the scene's
     numbers = list(AllChem.EmbedMultipleConfs(molecule, CONFORMERS - 1, randomSeed=seed % 2**31))
     starts = [scene.positions_nm, *(molecule.GetConformer(k).GetPositions() / 10.0 for k in numbers)]
     system = load_openmm(rough_parameters(scene)).createSystem()
@@ -197,7 +196,7 @@ def label(place: tuple[int, Entry, Path, int]) -> str:
     said = ""
     try:
         scene = prepare(f"smiles:{entry.smiles}")
-        states, potential = states_of(scene, n, SEED + number), Potential(scene)
+        states, potential = states_of(scene, entry.smiles, n, SEED + number), Potential(scene)
         turned = changed_stereo(scene, states)
         for state, other in zip(states, turned, strict=True):
             if not other and not changed_bond(scene, state, stretch=BROKEN):

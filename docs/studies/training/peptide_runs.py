@@ -9,7 +9,6 @@ there is left alone, so that the same command goes on after an interruption. One
 
 from __future__ import annotations
 
-import argparse
 import json
 import os
 import time
@@ -21,19 +20,15 @@ from typing import Any
 import numpy as np
 from peptide_list import Peptide, held_out_peptides, training_peptides
 from peptide_seeds import Seeds, choose_seeds
-from processes import in_order, only_here
+from processes import arguments_of, in_order, only_here, run_path, simulate_runs
 
 from md_reference.forces.spec import ForceFieldSpec
 from md_reference.run.config import SIMD, MDConfig
 from md_reference.run.engine import Engine
-from md_reference.run.machine import available_cores
-from md_reference.run.replicas import simulate_batch
 from md_reference.simd.force_field import n_replicas
 from systems.prepare.peptide import build_peptide
 from systems.scene import Scene
 from systems.trajectory.codec import open_trajectory
-from systems.trajectory.companion_writer import topology_path
-from systems.units import parse_wall_s
 
 DISCARD_PS, TEST_DISCARD_PS = 20.0, 1000.0
 _SPEC = ForceFieldSpec("ff14SB", "obc2")
@@ -58,10 +53,6 @@ def simulate_peptide(folder: Path, peptide: Peptide, deadline: float, *, seeded:
             missing = missing[
                 simulate(scene, seeds, missing, folder, peptide, TEST_DISCARD_PS if not seeded else DISCARD_PS) :
             ]
-
-
-def run_path(folder: Path, k: int) -> Path:
-    return folder / f"run_{k:03d}.h5"
 
 
 def _seed_of(peptide: Peptide, k: int) -> int:
@@ -99,12 +90,8 @@ def simulate(
         time_ps=peptide.time_ps, equilibrate_ps=discard_ps, seed=_seed_of(peptide, wanted[0]), force=_SPEC,
         platform=SIMD,
     )  # fmt: skip
-    parts = [folder / f".{run_path(folder, k).stem}.part.h5" for k in wanted]
     notes = [{"start": {"group": seeds.groups[k], "index": k, "discarded_ps": discard_ps}} for k in wanted]
-    simulate_batch(scene, config, parts, resume=True, starts_nm=seeds.positions_nm[wanted], notes=notes)
-    for k, part in zip(wanted, parts, strict=True):
-        os.replace(topology_path(part), topology_path(run_path(folder, k)))
-        os.replace(part, run_path(folder, k))
+    simulate_runs(scene, config, folder, wanted, starts_nm=seeds.positions_nm[wanted], notes=notes)
     return len(wanted)
 
 
@@ -149,16 +136,11 @@ def check(folder: Path) -> list[str]:
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("folder", type=Path)
-    parser.add_argument("--budget", default="3h", help="wall time after which no further run is begun")
-    parser.add_argument("--workers", type=int, default=available_cores())
-    parser.add_argument("--summary", action="store_true", help="say what is there and check it; simulate nothing")
-    chosen = parser.parse_args(arguments)
+    chosen = arguments_of(__doc__, "--summary", "say what is there and check it; simulate nothing", arguments)
     if chosen.summary:
         print(json.dumps({**summary(chosen.folder), "wrong": check(chosen.folder)}, indent=1))  # noqa: T201
         return
-    in_order(_order, _make, parse_wall_s(chosen.budget, "--budget"), chosen.workers, str(chosen.folder))
+    in_order(_order, _make, chosen.budget_s, chosen.workers, str(chosen.folder))
     print(json.dumps(summary(chosen.folder)["ns"]))  # noqa: T201
 
 

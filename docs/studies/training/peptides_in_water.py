@@ -11,8 +11,6 @@ and of the training set by turns, the test set first. What is there is left alon
 
 from __future__ import annotations
 
-import argparse
-import os
 import sys
 import zlib
 from collections.abc import Sequence
@@ -21,22 +19,18 @@ from typing import Any
 
 import numpy as np
 from peptide_list import Peptide, training_peptides
-from processes import in_order, only_here
+from processes import arguments_of, in_order, only_here, parts_of, run_path, simulate_runs
 
 from md_reference.forces.forcefield import build_system
 from md_reference.forces.solvation import solvate
 from md_reference.forces.spec import ForceFieldSpec, WaterBox
 from md_reference.run.config import SIMD, Conditions, MDConfig
 from md_reference.run.engine import Engine
-from md_reference.run.machine import available_cores
-from md_reference.run.replicas import simulate_batch
 from md_reference.simd.force_field import SimdReplicas, n_replicas
 from systems.chemistry.geometry import torsion
 from systems.chemistry.graph import rotatable_torsions
 from systems.prepare.peptide import build_peptide
 from systems.scene import FloatArray, IntArray, Scene
-from systems.trajectory.companion_writer import topology_path
-from systems.units import parse_wall_s
 
 WATER, IMPLICIT = ForceFieldSpec("ff14SB", "tip3p"), ForceFieldSpec("ff14SB", "obc2")
 # Pairs and chains are not among the training peptides, in no solvent; monomers are tested on runs of their own.
@@ -94,8 +88,8 @@ def starts_in_water(wet: Scene, quads: IntArray, angles: FloatArray, seed: int) 
 
 def batch(folder: Path, peptide: Peptide, number: int) -> None:
     """Simulate the batch of this number, from wherever it stands. Raises SimulationError, KeyboardInterrupt."""
-    names = [f"run_{k:03d}.h5" for k in range(number * n_replicas(), (number + 1) * n_replicas())]
-    if all((folder / name).exists() for name in names):
+    numbers = range(number * n_replicas(), (number + 1) * n_replicas())
+    if all(run_path(folder, k).exists() for k in numbers):
         return
     with only_here(folder) as free:
         if not free:
@@ -103,18 +97,14 @@ def batch(folder: Path, peptide: Peptide, number: int) -> None:
         dry = build_peptide(peptide.sequence)
         wet = solvate(dry, WATER, WaterBox())
         seed = zlib.crc32(f"water:{peptide.name}:{number}".encode()) % (2**31 - 2)
-        parts = [folder / f".{name[:-3]}.part.h5" for name in names]
         starts = None
-        if not any(part.exists() for part in parts):
+        if not any(part.exists() for part in parts_of(folder, numbers)):
             quads = rotatable_torsions(dry)
             starts = starts_in_water(wet, quads, many_states(dry, quads, seed), seed)
         config = MDConfig(
             force=WATER, time_ps=peptide.time_ps, equilibrate_ps=DISCARDED_PS, seed=seed, platform=SIMD, keep="solute"
         )
-        simulate_batch(wet, config, parts, resume=True, starts_nm=starts)
-        for part, name in zip(parts, names, strict=True):
-            os.replace(topology_path(part), topology_path(folder / name))
-            os.replace(part, folder / name)
+        simulate_runs(wet, config, folder, numbers, starts_nm=starts)
 
 
 def order() -> list[tuple[str, Peptide, int]]:
@@ -134,19 +124,14 @@ def make(task: tuple[str, Peptide, int], deadline: float, folder: str) -> None:
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("folder", type=Path)
-    parser.add_argument("--budget", default="3h", help="wall time after which no further batch is begun")
-    parser.add_argument("--workers", type=int, default=available_cores())
-    parser.add_argument("--list", action="store_true", help="print what is there and simulate nothing")
-    chosen = parser.parse_args(arguments)
+    chosen = arguments_of(__doc__, "--list", "print what is there and simulate nothing", arguments)
     if chosen.list:
         for kind, peptide, number in order():
             done = len(list((chosen.folder / kind / peptide.name).glob("run_*.h5"))) - number * n_replicas()
             if done > 0:
                 sys.stdout.write(f"{kind} {peptide.name} {min(done, n_replicas())} x {peptide.time_ps:g} ps\n")
         return
-    in_order(order, make, parse_wall_s(chosen.budget, "--budget"), chosen.workers, str(chosen.folder))
+    in_order(order, make, chosen.budget_s, chosen.workers, str(chosen.folder))
 
 
 if __name__ == "__main__":

@@ -1,7 +1,9 @@
-"""Shared by the commands that simulate many peptides: one process a core takes tasks in order until a deadline."""
+"""Shared by the commands that simulate many peptides: one process a core takes tasks in order until a deadline; batches
+of SIMD replicas."""
 
 from __future__ import annotations
 
+import argparse
 import fcntl
 import multiprocessing
 import os
@@ -12,8 +14,45 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from md_reference.run.config import MDConfig
+from md_reference.run.machine import available_cores
+from md_reference.run.replicas import simulate_batch
 from systems.errors import SimulationError
 from systems.interrupts import end_with_parent
+from systems.scene import Scene
+from systems.trajectory.companion_writer import topology_path
+from systems.units import parse_wall_s
+
+
+def arguments_of(about: str | None, switch: str, help: str, given: Sequence[str] | None) -> argparse.Namespace:
+    """Read the command line that these commands have in common, and one switch of their own."""
+    parser = argparse.ArgumentParser(description=about, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("--budget", default="3h", help="wall time after which no further run is begun")
+    parser.add_argument("--workers", type=int, default=available_cores())
+    parser.add_argument(switch, action="store_true", help=help)
+    chosen = parser.parse_args(given)
+    chosen.budget_s = parse_wall_s(chosen.budget, "--budget")
+    return chosen
+
+
+def run_path(folder: Path, k: int) -> Path:
+    return folder / f"run_{k:03d}.h5"
+
+
+def parts_of(folder: Path, numbers: Sequence[int]) -> list[Path]:
+    """Where the files of runs lie while they lack frames."""
+    return [folder / f".{run_path(folder, k).stem}.part.h5" for k in numbers]
+
+
+def simulate_runs(scene: Scene, config: MDConfig, folder: Path, numbers: Sequence[int], **how: Any) -> None:
+    """Simulate the runs of these numbers at once, from wherever they stand; files get their names when all frames are
+    there. `how`: further arguments of `simulate_batch`. Raises SimulationError, KeyboardInterrupt."""
+    parts = parts_of(folder, numbers)
+    simulate_batch(scene, config, parts, resume=True, **how)
+    for k, part in zip(numbers, parts, strict=True):
+        os.replace(topology_path(part), topology_path(run_path(folder, k)))
+        os.replace(part, run_path(folder, k))
 
 
 def in_order(

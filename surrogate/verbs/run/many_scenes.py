@@ -22,8 +22,7 @@ from md_reference.campaign.campaign_file import (
 )
 from md_reference.campaign.cluster import guarded, open_client, poll, result_of, stop
 from surrogate.progress import progress_bar
-from surrogate.verbs.messages import tell
-from surrogate.verbs.options import RunOptions
+from surrogate.verbs.options import RunOptions, tell
 from surrogate.verbs.run.decision import LEAST_BUDGET_S
 from surrogate.verbs.run.one_scene import run_scene
 from surrogate.verbs.run.results_page import write_results

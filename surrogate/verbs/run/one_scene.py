@@ -13,8 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
 from surrogate.progress import progress_bar
-from surrogate.verbs.messages import tell
-from surrogate.verbs.options import RunOptions
+from surrogate.verbs.options import RunOptions, tell
 from surrogate.verbs.reference import resolve_run
 from surrogate.verbs.run.decision import (
     LEAST_MD_S,
@@ -38,7 +37,7 @@ from surrogate.verbs.run.run_record import (
 )
 from surrogate.verbs.run.stage_clock import Clock
 from surrogate.verbs.run.stages import STAGES, Site, md_options
-from surrogate.verbs.scene_listing import prepare_scene
+from surrogate.verbs.scenes import prepare_scene
 from systems.errors import InputError, SimulationError, SurromdError
 from systems.files.whole_file import OutputLock
 

@@ -158,8 +158,8 @@ def _by_simd(rates: Rates, scene: Scene, config: MDConfig) -> Rates:
 
 def by_openmm(rates: Rates, scene: Scene, config: MDConfig, why: str) -> Rates:
     """Return the rates without SIMD, which is because of `why`."""
+    from md_reference.run.machine import choose_platform
     from md_reference.run.plan import plan_line
-    from md_reference.run.platforms import choose_platform
 
     choice = choose_platform(scene.n_atoms, "auto", born=config.force.is_born)
     line = plan_line(scene, config, choice, step_s=rates.step_s)

@@ -5,8 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from surrogate.verbs.messages import tell
-from surrogate.verbs.options import PathLike, RunOptions
+from surrogate.verbs.options import PathLike, RunOptions, tell
 from surrogate.verbs.run.decision import table
 from surrogate.verbs.run.many_scenes import molecules_in, run_many
 from surrogate.verbs.run.one_scene import plan_scene, run_scene

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 from library_runs import run_scene
 
+from md_reference.forces import gaff
 from md_reference.forces.forcefield import build_system, resolve
-from md_reference.forces.small_molecules import gaff
 from md_reference.forces.spec import ForceFieldSpec
 from md_reference.run.config import Conditions, defaults, resolve_settings, to_config
 from md_reference.run.engine import Engine
@@ -35,7 +35,7 @@ def no_ambertools(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
         raise AssertionError("a program was started")
 
     monkeypatch.setenv("SURROMD_CACHE", str(tmp_path))
-    monkeypatch.setattr("md_reference.forces.small_molecules.programs.find_ambertools", lambda: None)
+    monkeypatch.setattr("md_reference.forces.programs.find_ambertools", lambda: None)
     monkeypatch.setattr(gaff, "find_ambertools", lambda: None)
     monkeypatch.setattr(subprocess, "run", refused)
     monkeypatch.setattr(subprocess, "Popen", refused)
@@ -117,12 +117,19 @@ def test_a_protocol_is_asked_for_by_name_and_outweighed_by_what_is_given() -> No
         scene = prepare(name)
         settings, said = resolve_settings(scene, {}, "md17")
         assert {key: settings[key] for key in md17} == md17
-        for word in ("by protocol md17", "500 K", "0.5 fs", "5 fs", "gaff2", "GAFF2 for their PBE"):
+        for word in (
+            "by protocol md17",
+            "temperature 500K",
+            "timestep 0.5fs",
+            "save every 5fs",
+            "gaff2",
+            "GAFF2 for their PBE",
+        ):
             assert word in said
         warmer, said = resolve_settings(scene, {"temperature_k": 600.0, "save_every_ps": 0.01}, "md17")
         assert (warmer["temperature_k"], warmer["save_every_ps"], warmer["timestep_ps"]) == (600.0, 0.01, 0.0005)
         assert "temperature" not in said
-        assert "saved" not in said
+        assert "save every" not in said
 
 
 def test_without_a_protocol_the_defaults_hold_and_nothing_is_said() -> None:

@@ -13,9 +13,10 @@ from pathlib import Path
 
 import pytest
 
-from md_reference.forces.small_molecules.programs import run_program, scratch_folder
+from md_reference.forces import programs
+from md_reference.forces.programs import run_program, scratch_folder
 from process_table import needs_process_table, processes_with, runs, wait_until
-from systems.errors import StorageError
+from systems.errors import PreparationError, StorageError
 from systems.interrupts import deferred_interrupt, stop_when
 
 # A program that starts another, as antechamber starts sqm; it says so in its folder, and then both stay.
@@ -35,6 +36,14 @@ def test_what_a_program_says_and_how_it_ended(tmp_path: Path) -> None:
     assert run_program(["true"], tmp_path, environment) == (0, "")
     assert run_program(["/bin/sh", "-c", "kill -SEGV $$"], tmp_path, environment)[0] == 128 + signal.SIGSEGV
     assert run_program(["./absent"], tmp_path, environment)[0] == 127
+
+
+def test_a_failure_of_ambertools_is_said_in_its_own_words(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "bad").write_text("#!/bin/sh\necho 'Error: no such atom type'\nexit 3\n")
+    (tmp_path / "bad").chmod(0o755)
+    monkeypatch.setattr(programs, "ambertools", lambda: programs.AmberTools(tmp_path, "test", "test"))
+    with pytest.raises(PreparationError, match="bad failed: Error: no such atom type"):
+        programs.run("bad", [], tmp_path)
 
 
 def test_a_caller_is_told_that_it_still_runs(tmp_path: Path) -> None:
@@ -77,7 +86,7 @@ def test_kill_minus_nine_ends_the_program_and_its_children_too(tmp_path: Path) -
 _CHILD = """
 import contextlib, os, sys
 from pathlib import Path
-from md_reference.forces.small_molecules.programs import run_program, scratch_folder
+from md_reference.forces.programs import run_program, scratch_folder
 from systems.interrupts import deferred_interrupt, interrupted_by_signals
 
 try:

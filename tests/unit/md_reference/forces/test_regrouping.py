@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from md_reference.forces.forcefield import build_system
-from md_reference.forces.regrouping import permuted, regroup
+from md_reference.forces.mixture import permuted, regroup
 from md_reference.forces.spec import ForceFieldSpec
 from md_reference.run.config import Conditions
 from md_reference.run.engine import Engine
@@ -60,10 +60,9 @@ def order(alanine_dipeptide: Scene) -> IntArray:
 
 
 @pytest.mark.parametrize("spec", SPECS.values(), ids=SPECS)
-@pytest.mark.parametrize("native_gb", [True, False], ids=["native", "custom"])
 @pytest.mark.parametrize("form", ["one residue", "one residue, shuffled", "residues interleaved"])
 def test_same_system_as_the_library_scene(
-    alanine_dipeptide: Scene, order: IntArray, form: str, spec: ForceFieldSpec, native_gb: bool
+    alanine_dipeptide: Scene, order: IntArray, form: str, spec: ForceFieldSpec
 ) -> None:
     order = np.arange(22) if form == "one residue" else order
     scene = shuffled(alanine_dipeptide, order)
@@ -71,8 +70,8 @@ def test_same_system_as_the_library_scene(
         scene = as_one_residue(scene)
     rng = np.random.default_rng(0)
     with (
-        Engine(alanine_dipeptide, Conditions(force=spec), native_gb=native_gb) as expected,
-        Engine(scene, Conditions(force=spec), native_gb=native_gb) as engine,
+        Engine(alanine_dipeptide, Conditions(force=spec)) as expected,
+        Engine(scene, Conditions(force=spec)) as engine,
     ):
         assert engine.n_constraints == expected.n_constraints
         for _ in range(3):

@@ -19,7 +19,7 @@ from md_reference.forces.spec import ForceFieldSpec, WaterBox
 from md_reference.run import simulate as module
 from md_reference.run.config import Conditions
 from md_reference.run.engine import Engine
-from md_reference.run.platforms import PlatformChoice
+from md_reference.run.machine import PlatformChoice
 from md_reference.run.simulate import MDConfig, checkpoint_path, simulate
 from systems.errors import InputError, SimulationError, TrajectoryError, UnknownNameError
 from systems.scene import Scene

@@ -3,36 +3,34 @@
 from __future__ import annotations
 
 import json
+from dataclasses import asdict
 
 import pytest
 
 from md_reference.forces.spec import ForceFieldSpec
 from md_reference.run.config import MDConfig
-from md_reference.run.machine import available_cores
+from md_reference.run.machine import available_cores, choose_platform
 from md_reference.run.plan import make_plan
-from md_reference.run.platforms import choose_platform
 from systems.errors import UnknownNameError
 from systems.scene import Scene
 
 
 def skipped(scene: Scene, spec: ForceFieldSpec) -> set[str]:
-    return {skip.what for skip in make_plan(scene, MDConfig(time_ps=0.0, force=spec), measure_s=0.0).skipped}
+    return {skip.what for skip in make_plan(scene, MDConfig(time_ps=0.0, force=spec), timed=False).skipped}
 
 
 def test_terms_and_constraints_are_those_of_the_molecule(alanine_dipeptide: Scene) -> None:
-    plan = make_plan(alanine_dipeptide, MDConfig(time_ps=0.0), measure_s=0.0)
+    plan = make_plan(alanine_dipeptide, MDConfig(time_ps=0.0), timed=False)
     n_hydrogen = alanine_dipeptide.elements.count("H")
     assert plan.constraints == f"{n_hydrogen} bonds to hydrogen"
     assert plan.terms["NonbondedForce"] == plan.terms["GBSAOBCForce"] == 22
     assert plan.platform == "Reference"
     assert plan.us_per_step is None
-    json.dumps(plan.to_dict())
+    json.dumps(asdict(plan))
 
 
 def test_vacuum_has_no_born_term_and_obc2_no_custom_one(alanine_dipeptide: Scene) -> None:
-    in_vacuum = make_plan(
-        alanine_dipeptide, MDConfig(time_ps=0.0, force=ForceFieldSpec(solvent="vacuum")), measure_s=0.0
-    )
+    in_vacuum = make_plan(alanine_dipeptide, MDConfig(time_ps=0.0, force=ForceFieldSpec(solvent="vacuum")), timed=False)
     assert "GBSAOBCForce" not in in_vacuum.terms
     assert "generalised Born term" in skipped(alanine_dipeptide, ForceFieldSpec(solvent="vacuum"))
     assert "generalised Born term" not in skipped(alanine_dipeptide, ForceFieldSpec())
@@ -41,33 +39,33 @@ def test_vacuum_has_no_born_term_and_obc2_no_custom_one(alanine_dipeptide: Scene
 
 def test_a_long_step_with_natural_hydrogens_is_warned_of(alanine_dipeptide: Scene) -> None:
     natural = ForceFieldSpec(hydrogen_mass_da=None)
-    assert make_plan(alanine_dipeptide, MDConfig(time_ps=0.0, force=natural, timestep_ps=0.004), measure_s=0.0).warnings
+    assert make_plan(alanine_dipeptide, MDConfig(time_ps=0.0, force=natural, timestep_ps=0.004), timed=False).warnings
     assert not make_plan(
-        alanine_dipeptide, MDConfig(time_ps=0.0, force=natural, timestep_ps=0.002), measure_s=0.0
+        alanine_dipeptide, MDConfig(time_ps=0.0, force=natural, timestep_ps=0.002), timed=False
     ).warnings
-    assert not make_plan(alanine_dipeptide, MDConfig(time_ps=0.0, timestep_ps=0.004), measure_s=0.0).warnings
+    assert not make_plan(alanine_dipeptide, MDConfig(time_ps=0.0, timestep_ps=0.004), timed=False).warnings
 
 
 def test_the_platform_asked_for_is_kept_or_refused(alanine_dipeptide: Scene) -> None:
-    assert make_plan(alanine_dipeptide, MDConfig(time_ps=0.0, platform="CPU"), measure_s=0.0).platform == "CPU"
+    assert make_plan(alanine_dipeptide, MDConfig(time_ps=0.0, platform="CPU"), timed=False).platform == "CPU"
     with pytest.raises(UnknownNameError, match="Reference"):
-        make_plan(alanine_dipeptide, MDConfig(time_ps=0.0, platform="Referense"), measure_s=0.0)
+        make_plan(alanine_dipeptide, MDConfig(time_ps=0.0, platform="Referense"), timed=False)
 
 
 def test_steps_are_timed_and_the_saving_is_stated(alanine_dipeptide: Scene) -> None:
-    plan = make_plan(alanine_dipeptide, MDConfig(time_ps=0.0), measure_s=0.1)
+    plan = make_plan(alanine_dipeptide, MDConfig(time_ps=0.0))
     assert plan.us_per_step is not None and plan.ns_per_day is not None
     assert plan.ns_per_day == pytest.approx(0.004e-3 * 86_400.0 / (plan.us_per_step * 1e-6))
     assert "times faster" in plan.skipped[-1].saves
 
 
 def test_the_wall_time_of_a_length_is_estimated(alanine_dipeptide: Scene) -> None:
-    plan = make_plan(alanine_dipeptide, MDConfig(time_ps=900.0), replicas=3 * available_cores(), measure_s=0.05)
+    plan = make_plan(alanine_dipeptide, MDConfig(time_ps=900.0), replicas=3 * available_cores())
     assert plan.length == "900 ps"
     assert plan.us_per_step is not None
     # A nanosecond with its 100 ps of equilibration, three rounds of replicas.
     assert plan.wall_s == pytest.approx(3 * 250_000 * plan.us_per_step * 1e-6)
-    assert make_plan(alanine_dipeptide, MDConfig(time_ps=900.0), measure_s=0.0).wall_s is None
+    assert make_plan(alanine_dipeptide, MDConfig(time_ps=900.0), timed=False).wall_s is None
 
 
 @pytest.mark.parametrize(

@@ -6,15 +6,24 @@ import json
 import os
 from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 
 from md_reference.forces.spec import ForceFieldSpec
-from md_reference.run import machine, platforms
+from md_reference.run import machine
 from md_reference.run.config import Conditions
-from md_reference.run.machine import Timing, cache_file, recall, remember, size_class
-from md_reference.run.platforms import PlatformChoice, choose_fastest, measured_platform, timing_key
+from md_reference.run.machine import (
+    PlatformChoice,
+    Timing,
+    cache_file,
+    choose_fastest,
+    measured_platform,
+    recall,
+    remember,
+    timing_key,
+)
 from systems.library.named_scenes import load
 from systems.scene import Scene
 
@@ -40,7 +49,7 @@ def counted(monkeypatch: pytest.MonkeyPatch) -> list[list[tuple[str, int]]]:
         speeds = {("CPU", 1): 40.0, ("CPU", 2): 15.0, ("Reference", 1): 50.0}
         return [Timing(*c, speeds.get(c)) for c in candidates]
 
-    monkeypatch.setattr(platforms, "time_platforms", invent)
+    monkeypatch.setattr(machine, "time_platforms", invent)
     return asked
 
 
@@ -86,8 +95,11 @@ def test_what_was_timed_is_remembered_for_scenes_like_it(
 
 
 def test_size_classes_are_a_tenth_wide() -> None:
-    assert size_class(21) == size_class(22) != size_class(24)
-    assert size_class(1010) == size_class(1050) != size_class(1200)
+    def key(n_atoms: int) -> str:
+        return timing_key(SimpleNamespace(n_atoms=n_atoms, interactions=None, cell_nm=None), VACUUM)  # type: ignore[arg-type]
+
+    assert key(21) == key(22) != key(24)
+    assert key(1010) == key(1050) != key(1200)
 
 
 def test_threads_are_timed_beside_one_thread_and_only_where_they_may_win(
@@ -95,7 +107,7 @@ def test_threads_are_timed_beside_one_thread_and_only_where_they_may_win(
 ) -> None:
     measured_platform(alanine_dipeptide, Conditions(force=VACUUM), max_threads=2)
     assert counted[-1] == [("CPU", 1), ("Reference", 1)]
-    monkeypatch.setattr(platforms, "_THREADS_TIMED_ATOMS", 1)
+    monkeypatch.setattr(machine, "_THREADS_TIMED_ATOMS", 1)
     choice = measured_platform(alanine_dipeptide, Conditions(force=VACUUM), max_threads=2)
     assert counted[-1] == [("CPU", 1), ("CPU", 2)]
     assert (choice.name, choice.threads) == ("CPU", 2)
@@ -179,7 +191,7 @@ def test_on_busy_cores_threads_are_not_timed(alanine_dipeptide: Scene, monkeypat
 
         return fake
 
-    monkeypatch.setattr(platforms, "_THREADS_TIMED_ATOMS", 1)
+    monkeypatch.setattr(machine, "_THREADS_TIMED_ATOMS", 1)
     monkeypatch.setattr(machine, "_batch", batch(2.5))
     busy = measured_platform(alanine_dipeptide, Conditions(force=VACUUM), max_threads=2)
     assert busy.threads == 1

@@ -15,17 +15,22 @@ import pytest
 from compare_speed import pose, torsion_path
 from typer.testing import CliRunner
 
-from surrogate.bench.cost_error.cost_page import crossings, markdown
-from surrogate.bench.cost_error.errors_beside_md import (
-    ReferenceForces,
+from surrogate.bench.accuracy import (
+    HeldOut,
+    break_even,
     compare_frames,
     compare_reference,
+    effective_row,
     equivalent_time_row,
+    pareto_front,
     read_reference,
+    samples_per_second,
+    slowest_torsion,
+    training_cost,
 )
-from surrogate.bench.cost_error.sweep import run_cost_error
-from surrogate.bench.cost_error.sweep_settings import CostErrorConfig, Setting, Sweep, choose_settings
-from surrogate.bench.held_out import refuse_trained_on
+from surrogate.bench.bench_options import CostErrorConfig, Setting, Sweep
+from surrogate.bench.cost_error import choose_settings, refuse_trained_on, run_cost_error
+from surrogate.bench.cost_page import effective_lines, markdown
 from surrogate.cli import main
 from surrogate.models.architecture import weights_path
 from surrogate.models.weights import Weights, load_weights, save_weights
@@ -58,7 +63,7 @@ def held(tmp_path_factory: pytest.TempPathFactory, alanine_dipeptide: Scene) -> 
 
 
 @pytest.fixture(scope="module")
-def reference(held: tuple[Path, Path], alanine_dipeptide: Scene) -> ReferenceForces:
+def reference(held: tuple[Path, Path], alanine_dipeptide: Scene) -> HeldOut:
     return read_reference(alanine_dipeptide, held[:1], held[1:])
 
 
@@ -72,7 +77,7 @@ def weights(tmp_path_factory: pytest.TempPathFactory, small_weights: Weights) ->
 
 
 def test_a_true_rollout_is_equivalent_time_its_length_and_a_wrong_one_little(
-    reference: ReferenceForces, alanine_dipeptide: Scene
+    reference: HeldOut, alanine_dipeptide: Scene
 ) -> None:
     frames = toy_frames(alanine_dipeptide, 9, 3_000).astype(np.float64)
     right, equivalent_time = compare_frames(frames.reshape(3, 1_000, 22, 3), reference)
@@ -104,7 +109,7 @@ def test_a_true_rollout_is_equivalent_time_its_length_and_a_wrong_one_little(
 
 
 def test_equivalent_time_is_turned_into_seconds_and_never_beyond_the_floor(
-    reference: ReferenceForces, alanine_dipeptide: Scene
+    reference: HeldOut, alanine_dipeptide: Scene
 ) -> None:
     _, equivalent_time = compare_frames(toy_frames(alanine_dipeptide, 5, 3_000)[None].astype(np.float64), reference)
     row = equivalent_time_row(equivalent_time, spent_s=2.0, md_s_per_ns=8.0)
@@ -214,15 +219,10 @@ def test_a_whole_benchmark_is_written_and_gone_on_with(
     assert (tmp_path / "cost_error.svg").read_text().rstrip().endswith("</svg>")
     with pytest.raises(InputError, match="other references, times or rounds"):
         run_cost_error([(weights, [one])], held[1:], held[:1], tmp_path, config)
-    # Where molecules break, nothing is said of crossings.
-    torn = json.loads(json.dumps(again))
-    for row in torn["rows"]:
-        row |= {"valid_half_angstrom_%": {"value": 50.0}} if "jsd" in row else {}
-    assert not crossings(torn)
 
 
 def test_weights_that_know_lags_are_held_against_frames_as_far_apart(
-    tmp_path: Path, reference: ReferenceForces, held: tuple[Path, Path], weights: Weights, alanine_dipeptide: Scene
+    tmp_path: Path, reference: HeldOut, held: tuple[Path, Path], weights: Weights, alanine_dipeptide: Scene
 ) -> None:
     runs = [
         write(
@@ -285,3 +285,82 @@ def test_the_verb_says_in_one_line_what_it_cannot_use(
         assert result.exit_code == 1 and said in result.stderr, result.output
         assert len(result.stderr.strip().splitlines()) == 1
         assert not list(tmp_path.iterdir())
+
+
+# ---- effective samples ---------------------------------------------------------------------------------------------
+
+
+def test_forgetting_too_fast_earns_nothing_and_too_slowly_costs() -> None:
+    right = samples_per_second(2.0, 25.0, 25.0)
+    assert right == pytest.approx(1e3 / 2.0 / 50.0)
+    assert samples_per_second(2.0, 5.0, 25.0) == right
+    assert samples_per_second(2.0, 50.0, 25.0) == pytest.approx(right / 2)
+    assert samples_per_second(2.0, None, 25.0) is None and samples_per_second(2.0, float("nan"), 25.0) is None
+    md = {"slowest": {"tau_ps": 25.0}, "cost": [
+        {"way": way, "cpu_s_per_ns": {"mean": cost}} for way, cost in (("ours", 32.0), ("ours", 8.0), ("simd", 0.5))
+    ]}  # fmt: skip
+    row: dict[str, Any] = {"cpu_s_per_ns": {"mean": 2.0}}
+    assert effective_row(row, 20.0, md)["effective_over_md"] == pytest.approx(4.0), "of the fastest MD"
+    assert effective_row(row, 20.0, md | {"slowest": None}) == {}
+
+
+def test_the_slowest_torsion_is_one_whose_time_is_known(monkeypatch: pytest.MonkeyPatch) -> None:
+    taus = [4.0, 25.0, 900.0]
+
+    class Value:
+        def __init__(self, value: float) -> None:
+            self.value = value
+
+    class Fake:
+        class features:
+            total_ps = 10_000.0
+
+    names = [("ψ", ""), ("", "χ of 3"), ("φ", "")]
+    monkeypatch.setattr("surrogate.bench.accuracy.turning", lambda f: [(s, label, []) for s, label in names])
+    monkeypatch.setattr("surrogate.bench.accuracy.relaxation_of", lambda sample, k: (Value(0.0), Value(taus[k])))
+    found = slowest_torsion([Fake(), Fake()])  # type: ignore[list-item]
+    assert found is not None and found["name"] == "cos χ of 3" and found["samples"] == pytest.approx(20_000 / 50)
+    assert slowest_torsion([Fake()] * 40)["name"] == "cos φ", "with 222 of it at hand"  # type: ignore[list-item,index]
+    taus[:] = [np.nan, 0.0, 900.0]
+    assert slowest_torsion([Fake()]) is None  # type: ignore[list-item]
+
+
+def test_the_front_holds_what_nothing_beats() -> None:
+    points = [(1.0, 0.1), (10.0, 0.2), (5.0, 0.3), (20.0, 0.5), (10.0, 0.25), (0.5, 0.1)]
+    assert pareto_front(points) == [3, 1, 0]
+    assert pareto_front([]) == []
+
+
+def test_a_training_pays_after_as_many_samples_as_it_saves_seconds() -> None:
+    # A sample takes MD 0.5 s and the surrogate 0.1 s: 0.4 s saved each.
+    assert break_even(400.0, 10.0, 2.0) == pytest.approx(1000.0)
+    assert break_even(400.0, 2.0, 2.0) is None and break_even(400.0, None, 2.0) is None
+
+
+def test_all_trainings_and_all_frames_that_weights_saw_are_counted_once() -> None:
+    weights = load_weights(weights_path("alanine-dipeptide"))
+    cost = training_cost(weights, 8.0)
+    assert cost["training_s"] == pytest.approx(720.7 + 2448.1)
+    assert cost["reference_ns"] == pytest.approx(960.0), "32 runs of 30 ns"
+    assert cost["reference_s"] == pytest.approx(960.0 * 8.0)
+    potential = load_weights(weights_path("paracetamol-gfn2-xtb"))
+    assert training_cost(potential, 8.0)["training_s"] == pytest.approx(2088.8)
+    unknown = training_cost(replace(weights, provenance={}), 8.0)
+    assert unknown["training_s"] is None and unknown["reference_ns"] == 0.0
+
+
+def test_a_page_leaves_broken_molecules_out_of_the_front() -> None:
+    md = {
+        "slowest": {"torsion": 0, "name": "cos ψ", "tau_ps": 25.0, "samples": 4000.0},
+        "cost": [{"label": "OpenMM, 4 fs", "way": "ours", "cpu_s_per_ns": {"mean": 8.0}}],
+        "lengths_ps": [1e3, 1e5], "errors": [0.3, 0.05], "replicate_baseline": 0.05, "length_ps": 1e5,
+    }  # fmt: skip
+    row = {
+        "weights": "w", "label": "fitted 4", "effective_per_s": 50.0, "jsd": {"value": 0.1}, "first_chunks_s": 2.0,
+        "valid_half_angstrom_%": {"value": 99.9}, "before": {"training_s": 100.0, "reference_s": 50.0},
+    }  # fmt: skip
+    torn = row | {"label": "euler 2", "effective_per_s": 500.0, "valid_half_angstrom_%": {"value": 60.0}}
+    result = {"md": md, "rows": [row, torn], "config": {"time_ps": 1e5}}
+    text = "\n".join(effective_lines(result))
+    assert "| w, fitted 4 |" in text and "euler 2" not in text and "training (100 s)" in text
+    assert "not counted" in "\n".join(effective_lines({**result, "md": {**md, "slowest": None}}))

@@ -11,12 +11,19 @@ import numpy as np
 import pytest
 
 from md_reference.run.engine import Engine
-from surrogate.bench.stress.frame_statistics import measure_bonds, measure_drift, measure_validity
-from surrogate.bench.stress.odd_inputs import measure_invariance, measure_odd_inputs
-from surrogate.bench.stress.other_arithmetic import measure_batches, measure_openmm, measure_precision, openmm_of
-from surrogate.bench.stress.stress_options import StressOptions
-from surrogate.bench.stress.stress_page import markdown
-from surrogate.bench.stress.trials import StressConfig, choose_config, run_stress
+from surrogate.bench.bench_options import StressOptions
+from surrogate.bench.stress import (
+    StressConfig,
+    choose_config,
+    measure_batches,
+    measure_invariance,
+    measure_odd_inputs,
+    measure_openmm,
+    measure_precision,
+    openmm_of,
+    run_stress,
+)
+from surrogate.bench.stress_page import markdown, measure_bonds, measure_drift, measure_validity
 from surrogate.models.weights import Weights
 from systems.chemistry.graph import molecule_key
 from systems.chemistry.validity import Geometry, geometry_from_frames
@@ -39,14 +46,12 @@ def geometry(alanine_dipeptide: Scene, vibrating: np.ndarray) -> Geometry:
 def test_broken_frames_are_counted_and_dated(vibrating: np.ndarray, geometry: Geometry) -> None:
     whole = measure_validity(list(vibrating), geometry, 2.0)
     assert (whole.frames, whole.broken, whole.first_broken_ps) == (800, 0, None)
-    assert whole.survival == ((0.0, 1.0), (400.0, 1.0))
     broken = vibrating.copy()
     broken[1, 49, 0] += 0.3
     broken[1, 120:, 0] += 0.3
     broken[3, 9] = np.nan
     found = measure_validity(list(broken), geometry, 2.0)
     assert (found.broken, found.invalid, found.first_broken_ps) == (82, 82, 20.0)
-    assert found.survival == ((0.0, 1.0), (20.0, 0.75), (100.0, 0.5), (400.0, 0.5))
     assert found.to_dict()["valid_half_angstrom_%"] == pytest.approx(100 * (1 - 82 / 800))
 
 
@@ -76,7 +81,7 @@ def test_drift_between_first_and_last_tenth(
 
 def test_moved_and_permuted_input_gives_the_moved_chunk(small_weights: Weights) -> None:
     rows = {row["input"]: row for row in measure_invariance(small_weights, precision="fp32")}
-    assert len(rows) == 7 and rows["translated by 10 nm along x and y in a PDB file"]["deviation_nm"] > 0.0
+    assert len(rows) == 5 and rows["translated by 10 nm"]["deviation_nm"] > 0.0
     for name, row in rows.items():
         assert row["deviation_nm"] < (5e-6 if "1e+06" in name else 1e-6), name
     scene = small_weights.domain.scene
@@ -100,7 +105,6 @@ def test_arithmetic_and_batches(small_weights: Weights) -> None:
     rows = {row["arithmetic"]: row for row in measure_precision(small_weights, compiled=False)}
     assert 1e-9 < rows["fp32"]["deviation_nm"] < 1e-4 < 50 * rows["bf16"]["deviation_nm"]
     assert rows["bf16"]["rms_nm"] > 20 * rows["fp32"]["rms_nm"], "bf16 must not be float32 by another name"
-    assert rows["fp32, 1 thread"]["deviation_nm"] < 1e-4
     one, four = measure_batches(small_weights, batches=(1, 4))
     assert one["deviation_nm"] == 0.0 and four["deviation_nm"] < 1e-5
 
@@ -116,7 +120,6 @@ def test_a_whole_stress_test_writes_its_tables(tmp_path: Path, small_weights: We
     assert json.loads((tmp_path / "stress.json").read_text())["sections"]["length"][0]["frames"] == 80
     text = (tmp_path / "stress.md").read_text()
     assert "## Long rollouts" in text and "invalid unmarked" in text and text == markdown(result)
-    assert (tmp_path / "stress.svg").read_text().rstrip().endswith("</svg>")
 
 
 def test_a_stress_test_is_added_to(tmp_path: Path, small_weights: Weights) -> None:
@@ -157,7 +160,7 @@ def test_openmm_moves_in_every_frame_under_the_constraints_of_the_reference(
         usual(engine, n_steps)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("surrogate.bench.stress.other_arithmetic.DISCARDED_PS", 0.05)
+        patch.setattr("surrogate.bench.stress.DISCARDED_PS", 0.05)
         patch.setattr(Engine, "step", step)
         assert measure_openmm(replace(small_weights, domain=domain), n_frames=4)[0]["timestep_fs"] == 1.0
     assert taken[:5] == [50, 1, 1, 1, 1] and min(taken) == 1

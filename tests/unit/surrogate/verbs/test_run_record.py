@@ -86,7 +86,7 @@ def test_without_ambertools_a_run_ends_in_one_line_and_peptides_are_run(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     for place in ("gaff", "programs"):
-        monkeypatch.setattr(f"md_reference.forces.small_molecules.{place}.find_ambertools", lambda: None)
+        monkeypatch.setattr(f"md_reference.forces.{place}.find_ambertools", lambda: None)
     monkeypatch.setenv("SURROMD_CACHE", str(tmp_path / "cache"))
     for resume in (False, True):
         with pytest.raises(PreparationError, match="GAFF2 parameters need AmberTools") as caught:
@@ -195,9 +195,7 @@ def test_where_md_is_too_short_to_do_better_the_surrogate_s_populations_are_the_
     for holds, surrogate, is_by in ((False, 0.3, False), (False, 0.19, True), (True, 0.19, False)):
         more = state(state="left-handed", share=0.01, error=0.05, surrogate=surrogate)
         found_ = answer(holds=holds, states=(*vague, more))
-        assert found_.is_by_surrogate == is_by, (
-            "what MD contradicts is no answer"
-        )
+        assert found_.is_by_surrogate == is_by, "what MD contradicts is no answer"
     assert not answer(states=tuple(replace(s, surrogate_error=0.2) for s in vague)).is_by_surrogate, "nor what is vague"
     assert not answer(states=tuple(replace(s, surrogate=None) for s in vague)).is_by_surrogate
 

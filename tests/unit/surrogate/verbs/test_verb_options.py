@@ -118,9 +118,7 @@ def test_settings_and_campaigns_have_the_same_names_and_the_help_their_defaults(
             continue
         value = flag.read(text, name) if flag.read else type(known[name])(text)
         assert value == pytest.approx(known[name]), name
-        assert read_settings(
-            {key_of(name): value if name == "pressure_bar" else text}, axes={}, preparation={}, others=(), where=""
-        )
+        assert read_settings({key_of(name): value if name == "pressure_bar" else text})
 
 
 def test_another_default_in_the_help_would_be_noticed(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -9,7 +9,7 @@ import h5py
 import numpy as np
 import pytest
 
-from md_reference.forces.small_molecules.gaff import Entry, _read, store
+from md_reference.forces.gaff import Entry, read_entry, store
 from md_reference.forces.spec import ForceFieldSpec
 from md_reference.run.config import MDConfig, check_run
 from systems.chemistry.distance_bonds import bonds_by_distance
@@ -107,9 +107,9 @@ def test_a_cache_entry_that_has_changed_is_made_again(tmp_path: Path, alanine_di
     store(path, entry)
     text = gzip.decompress(path.read_bytes())
     assert b'"_seal"' in text
-    whole = _read(path)
+    whole = read_entry(path)
     path.write_bytes(gzip.compress(text.replace(b'"method": "test"', b'"method": "tesT"')))
-    assert _read(path) is None
+    assert read_entry(path) is None
     assert whole is None or whole.source == {"method": "test"}
 
 

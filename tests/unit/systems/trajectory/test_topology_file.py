@@ -9,11 +9,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from surrogate.verbs.outputs import TRAJECTORY_SUFFIXES, check_outputs
+from surrogate.verbs.outputs import check_outputs
 from systems.errors import SimulationError, TrajectoryError
 from systems.scene import Scene, part_of, reordered
 from systems.trajectory.checkpoint import locked_outputs
-from systems.trajectory.codec import open_trajectory, open_writer
+from systems.trajectory.codec import WRITTEN, open_trajectory, open_writer
 from systems.trajectory.companion_writer import pdb_text
 
 SUFFIXES = (".h5", ".dcd")
@@ -58,7 +58,7 @@ def test_another_program_s_pdb_is_never_replaced(tmp_path: Path, alanine_dipepti
         with pytest.raises(TrajectoryError, match=r"mine\.pdb is not ours"):
             write(path, alanine_dipeptide, overwrite=overwrite)
         with pytest.raises(TrajectoryError, match=r"mine\.pdb is not ours"):
-            check_outputs([path], TRAJECTORY_SUFFIXES, overwrite=overwrite)
+            check_outputs([path], WRITTEN, overwrite=overwrite)
     assert pdb.read_bytes() == before
     assert [p.name for p in tmp_path.iterdir()] == ["mine.pdb"]
 

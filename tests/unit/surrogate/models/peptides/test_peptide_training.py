@@ -13,7 +13,7 @@ from peptide_distil import distil
 
 import surrogate as sm
 from small_scenes import with_phi_turned
-from surrogate.bench.cost_error.effective_samples import training_cost
+from surrogate.bench.accuracy import training_cost
 from surrogate.data import Split, TrainingFrames, canonicalise, quantise
 from surrogate.models.architecture import TrainingRequest
 from surrogate.models.peptides import subjects as peptide_subjects

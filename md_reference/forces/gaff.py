@@ -1,4 +1,5 @@
-"""GAFF2 parameters and AM1-BCC charges of one molecule, through AmberTools; shipped and cached ones first.
+"""GAFF2 parameters and AM1-BCC charges of one molecule, through AmberTools; shipped and cached ones first. AMBER
+parameter files (prmtop) read, and put into another atom order.
 
 GAFF2: Wang, Wolf, Caldwell, Kollman and Case, J. Comput. Chem. 25, 1157 (2004), second generation (gaff2.dat). AM1-BCC:
 Jakalian, Jack and Bayly, J. Comput. Chem. 23, 1623 (2002).
@@ -9,26 +10,21 @@ from __future__ import annotations
 import gzip
 import json
 import logging
+import re
 import sys
+import tempfile
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
-import networkx as nx
+import numpy as np
 
-from md_reference.forces.small_molecules.prmtop import CHARGE_UNIT, Prmtop
-from md_reference.forces.small_molecules.programs import (
-    ambertools,
-    complaint,
-    find_ambertools,
-    gaff2_table,
-    run,
-    scratch_folder,
-)
+from md_reference.forces.mixture import molecules_of
+from md_reference.forces.programs import ambertools, complaint, find_ambertools, run, scratch_folder
 from md_reference.forces.spec import CHAIN_FILES, force_field_of, unmatched_residues
 from systems.chemistry.distance_bonds import changed_bond
 from systems.chemistry.graph import match_atoms, molecule_key
@@ -37,105 +33,13 @@ from systems.files.native import cache_folder
 from systems.files.outside import content
 from systems.files.schema import built, parsed
 from systems.files.whole_file import create_whole, sealed, storage_error, unsealed
-from systems.scene import Scene
+from systems.scene import FloatArray, IntArray, Scene
 from systems.units import format_wall
 
 _FORMAT = 1
-
-
-@dataclass(frozen=True)
-class Entry:
-    """Parameters of one molecule: prmtop text in the atom order of `template`, and where they come from."""
-
-    template: Scene
-    prmtop: str
-    source: dict[str, Any]
-
-    def ordered_as(self, scene: Scene) -> str:
-        """Return the prmtop text in the scene's atom order. Raises OutOfDomainError for another molecule."""
-        order = match_atoms(scene, self.template)
-        return Prmtop(self.prmtop).permuted(order).text()
-
-
-@dataclass(frozen=True)
-class _Record:
-    format: int
-    scene: Scene
-    prmtop: str
-    source: dict[str, Any]
-
-
-def shipped_folder() -> Path:
-    """Where the parameters lie that come with the package."""
-    return Path(str(files("systems.library") / "data" / "parameters"))
-
-
-def find_shipped(scene: Scene, method: str) -> Entry | None:
-    """Return the shipped parameters of this molecule, or None."""
-    return _read(shipped_folder() / f"{molecule_key(scene)}-{method}.json.gz")
-
-
-def find_cached(scene: Scene, method: str, version: str | None) -> Entry | None:
-    """Return parameters computed here earlier by this version (by any, the last by name, where `version` is None)."""
-    folder = cache_folder() / "parameters"
-    if version is not None:
-        return _read(folder / f"{molecule_key(scene)}-{method}-{version}.json.gz")
-    found = sorted(folder.glob(f"{molecule_key(scene)}-{method}-*.json.gz"))
-    return _read(found[-1]) if found else None
-
-
-def cached_path(scene: Scene, method: str, version: str) -> Path:
-    """Where `find_cached` looks."""
-    return cache_folder() / "parameters" / f"{molecule_key(scene)}-{method}-{version}.json.gz"
-
-
-def fits(entry: Entry | None, scene: Scene) -> bool:
-    """Return whether the entry's molecule is the scene's (keys are hashes, and some stereo is beyond them)."""
-    if entry is None:
-        return False
-    try:
-        match_atoms(scene, entry.template)
-    except OutOfDomainError:
-        return False
-    return True
-
-
-def store(path: Path, entry: Entry) -> Entry:
-    """Write an entry and return what lies there: of several processes that compute the same, the first one's stays.
-
-    The file appears whole or not at all. Raises StorageError when it cannot be written.
-    """
-    template = replace(entry.template, provenance={})
-    record = {"format": _FORMAT, "source": entry.source, "scene": template.to_dict(), "prmtop": entry.prmtop}
-    data = gzip.compress(sealed(json.dumps(record, sort_keys=True)).encode(), mtime=0)
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise storage_error(path, error, "nothing was changed") from error
-    existing = _read(path)
-    if existing is not None and fits(existing, entry.template):
-        return existing
-    create_whole(path, data)
-    return entry
-
-
-def _read(path: Path) -> Entry | None:
-    """Return an entry, or None where there is none or it is damaged (it is then made again)."""
-    try:
-        text = content(path).decode()
-        found = built(_Record, parsed(unsealed(text) if path.parent != shipped_folder() else text))
-        if found.format != _FORMAT or Prmtop(found.prmtop).n_atoms != found.scene.n_atoms:
-            return None
-        return Entry(found.scene, found.prmtop, found.source)
-    except (OSError, ValueError, LookupError, TypeError, InputError):
-        return None
-
-
-# ---- computed here --------------------------------------------------------------------------------------------------
-
-
 METHOD = "gaff2-am1bcc"
-ELEMENTS = ("H", "C", "N", "O", "F", "P", "S", "Cl", "Br", "I")
+# Parameters that come with the package.
+_SHIPPED = Path(str(files("systems.library") / "data" / "parameters"))
 _ATOMIC_NUMBERS = {"H": 1, "C": 6, "N": 7, "O": 8, "F": 9, "P": 15, "S": 16, "Cl": 17, "Br": 35, "I": 53}
 # `expected_s` says how SQM's cost grows: hours from here on.
 LARGEST = 250
@@ -147,8 +51,21 @@ _PARMCHK2_RUNS = 100
 # processor seconds on a core of an AMD EPYC, ten molecules of 21 to 72 atoms, none off by more than a factor of 2.3.
 SECONDS_AT_30_ATOMS = 7.3
 POWER = 3.3
-_EQUIVALENT_TIME_SAYING_S = 2.0
+_WORTH_SAYING_S = 2.0
 _log = logging.getLogger("surromd.charges")
+
+
+@dataclass(frozen=True)
+class Entry:
+    """Parameters of one molecule: prmtop text in the atom order of `scene`, and where they come from."""
+
+    scene: Scene
+    prmtop: str
+    source: dict[str, Any]
+
+    def ordered_as(self, scene: Scene) -> str:
+        """Return the prmtop text in the scene's atom order. Raises OutOfDomainError for another molecule."""
+        return Prmtop(self.prmtop).permuted(match_atoms(scene, self.scene)).text()
 
 
 def parameters(scene: Scene, *, cached: bool = True) -> str:
@@ -168,55 +85,83 @@ def entry(scene: Scene, *, cached: bool = True) -> Entry:
     refuse(scene)
     if not cached:
         return _parametrise(scene)
-    shipped = find_shipped(scene, METHOD)
-    if shipped is not None and fits(shipped, scene):
-        return shipped
-    tools = find_ambertools()
-    known = find_cached(scene, METHOD, None if tools is None else tools.label)
-    if known is not None and fits(known, scene):
-        return known
+    tools, folder, stem = find_ambertools(), cache_folder() / "parameters", f"{molecule_key(scene)}-{METHOD}"
+    # Without AmberTools what any version made, the last by name.
+    kept = [folder / f"{stem}-{tools.label}.json.gz"] if tools else sorted(folder.glob(f"{stem}-*.json.gz"))[-1:]
+    for path in (shipped_path(scene), *kept):
+        found = read_entry(path)
+        if found is not None and _fits(found, scene):
+            return found
     made = _parametrise(scene)
+    with suppress(StorageError):  # a cache that cannot be written costs time, not the run
+        made = store(kept[0], made)
+    return made
+
+
+def shipped_path(scene: Scene) -> Path:
+    """Return where the parameters of a molecule lie if they come with the package."""
+    return _SHIPPED / f"{molecule_key(scene)}-{METHOD}.json.gz"
+
+
+def store(path: Path, made: Entry) -> Entry:
+    """Write an entry and return what lies there: of several processes that compute the same, the first one's stays. The
+    file appears whole or not at all. Raises StorageError when it cannot be written."""
+    scene = replace(made.scene, provenance={}).to_dict()
+    record = {"format": _FORMAT, "source": made.source, "scene": scene, "prmtop": made.prmtop}
+    data = gzip.compress(sealed(json.dumps(record, sort_keys=True)).encode(), mtime=0)
     try:
-        return store(cached_path(scene, METHOD, ambertools().label), made)
-    except StorageError:
-        return made  # a cache that cannot be written costs time, not the run
+        path.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise storage_error(path, error, "nothing was changed") from error
+    existing = read_entry(path)
+    if existing is not None and _fits(existing, made.scene):
+        return existing
+    create_whole(path, data)
+    return made
 
 
-def write_shipped(scene: Scene) -> Path:
-    """Write the molecule's parameters into the package (systems/library/data/parameters) and return the file.
+def read_entry(path: Path) -> Entry | None:
+    """Return an entry, or None where there is none or it is damaged (it is then made again)."""
+    try:
+        text = content(path).decode()
+        record = dict(parsed(text if path.parent == _SHIPPED else unsealed(text)))
+        is_known = record.pop("format") == _FORMAT
+        found = built(Entry, record)
+        return found if is_known and Prmtop(found.prmtop).n_atoms == found.scene.n_atoms else None
+    except (OSError, ValueError, LookupError, TypeError, InputError):
+        return None
 
-    For the library's makers: `parameters` reads it before anything else, without AmberTools. What lies there is made
-    again. Raises as `parameters`.
-    """
-    refuse(scene)
-    found = _parametrise(scene)
-    path = shipped_folder() / f"{molecule_key(scene)}-{METHOD}.json.gz"
-    path.unlink(missing_ok=True)
-    store(path, found)
-    return path
+
+def _fits(found: Entry, scene: Scene) -> bool:
+    """Return whether the entry's molecule is the scene's (keys are hashes, and some stereo is beyond them)."""
+    try:
+        match_atoms(scene, found.scene)
+    except OutOfDomainError:
+        return False
+    return True
+
+
+# ---- computed here --------------------------------------------------------------------------------------------------
 
 
 def refuse(scene: Scene) -> None:
     """Raise PreparationError with the reason when GAFF2 with AM1-BCC cannot describe the scene."""
-    foreign = sorted(set(scene.elements) - set(ELEMENTS))
+    foreign = sorted(set(scene.elements) - set(_ATOMIC_NUMBERS))
     if foreign:
         raise PreparationError(
             f"GAFF2 has no parameters for {', '.join(foreign)} in scene {scene.name!r} (it covers "
-            f"{', '.join(ELEMENTS)}); use `level='gfn2-xtb'`."
+            f"{', '.join(_ATOMIC_NUMBERS)}); use `level='gfn2-xtb'`."
         )
-    graph: nx.Graph = nx.Graph()
-    graph.add_nodes_from(range(scene.n_atoms))
-    graph.add_edges_from(scene.bonds.tolist())
-    pieces = nx.number_connected_components(graph)
+    pieces = len(molecules_of(scene))
     if pieces != 1:
         raise PreparationError(f"scene {scene.name!r} holds {pieces} molecules; GAFF2 parameters are made one by one.")
     if scene.n_atoms < 2:
         raise PreparationError(f"GAFF2 has no parameters for a lone {scene.elements[0]} atom.")
-    crowded = [i for i, n in graph.degree if n > 4]
-    if crowded:
+    near = scene.neighbours()
+    for i in (i for i, around in enumerate(near) if len(around) > 4):
         raise PreparationError(
-            f"{scene.atom_names[crowded[0]]} in scene {scene.name!r} has {graph.degree(crowded[0])} neighbours; GAFF2 "
-            "has no angle terms for more than four. Use `level='gfn2-xtb'`."
+            f"{scene.atom_names[i]} in scene {scene.name!r} has {len(near[i])} neighbours; GAFF2 has no angle terms "
+            "for more than four. Use `level='gfn2-xtb'`."
         )
     charge = int(scene.formal_charges.sum())
     electrons = sum(_ATOMIC_NUMBERS[e] for e in scene.elements) - charge
@@ -228,24 +173,16 @@ def refuse(scene: Scene) -> None:
             "AM1-BCC are made for closed shells. Check hydrogens and charges, or use `level='gfn2-xtb'`."
         )
     if scene.n_atoms > LARGEST:
-        lacking = _without_template(scene)
-        culprits = f", which lacks {', '.join(lacking[:4])}" if lacking else ""
+        lacking: list[int] = []
+        with suppress(InputError):  # residues that are not contiguous
+            lacking = unmatched_residues(scene, force_field_of(CHAIN_FILES))
+        names = [f"{scene.residue_names[r]} {scene.residue_ids[r]}" for r in lacking[:4]]
+        culprits = f", which lacks {', '.join(names)}" if 0 < len(lacking) < len(scene.residue_names) else ""
         raise PreparationError(
             f"scene {scene.name!r} has {scene.n_atoms} atoms outside the protein force field{culprits}; AM1-BCC "
             f"charges for them take about {format_wall(expected_s(scene.n_atoms))}, and more than {LARGEST} are not "
             "computed. Give a smaller molecule, or one of standard residues."
         )
-
-
-def _without_template(scene: Scene) -> list[str]:
-    """Return the residues of a scene that no template of ff14SB fits, `PSU 39`; none where no residue has one."""
-    try:
-        found = unmatched_residues(scene, force_field_of(CHAIN_FILES))
-    except InputError:  # residues that are not contiguous
-        return []
-    if len(found) == len(scene.residue_names):
-        return []
-    return [f"{scene.residue_names[r]} {scene.residue_ids[r]}" for r in found]
 
 
 def rough_parameters(scene: Scene) -> str:
@@ -324,7 +261,8 @@ def _run_parmchk2(folder: Path) -> str:
     """
     arguments = ["-i", "checked.mol2", "-f", "mol2", "-o", "extra.frcmod", "-s", "gaff2"]
     typed = (folder / "typed.mol2").read_text()
-    has_canary = any(line.startswith(_CANARY) for line in gaff2_table().read_text(errors="replace").splitlines())
+    known = ambertools().gaff2_table.read_text(errors="replace").splitlines()
+    has_canary = any(line.startswith(_CANARY) for line in known)
     (folder / "checked.mol2").write_text(_with_canary(typed) if has_canary else typed)
     earlier: set[str] = set()
     for attempt in range(_PARMCHK2_RUNS):
@@ -370,20 +308,19 @@ def _assemble(folder: Path) -> str:
 
 def _check(scene: Scene, made: Prmtop) -> None:
     """Raise PreparationError unless the parameters are for exactly the scene's atoms, bonds and charge, in order."""
-    what = ""
-    numbers = [_ATOMIC_NUMBERS[e] for e in scene.elements]
     bonds = {(min(i, j), max(i, j)) for i, j in scene.bonds.tolist()}
-    charge = int(scene.formal_charges.sum())
-    if made.fields["ATOMIC_NUMBER"] != numbers:
+    charge, made_charge = int(scene.formal_charges.sum()), float(made.charges_e.sum())
+    if made.fields["ATOMIC_NUMBER"] != [_ATOMIC_NUMBERS[e] for e in scene.elements]:
         what = "other elements or another atom order"
     elif made.bonds != bonds:
         what = f"other bonds ({len(made.bonds - bonds)} more, {len(bonds - made.bonds)} fewer)"
-    elif abs(float(made.charges_e.sum()) - charge) > _CHARGE_TOLERANCE_E:
-        what = f"charge {float(made.charges_e.sum()):+.3f} instead of {charge:+d}"
+    elif abs(made_charge - charge) > _CHARGE_TOLERANCE_E:
+        what = f"charge {made_charge:+.3f} instead of {charge:+d}"
     elif {"DU", "du"} & set(made.fields["AMBER_ATOM_TYPE"]):
         what = "atoms it found no type for"
-    if what:
-        raise PreparationError(f"AmberTools made parameters with {what} for scene {scene.name!r}; check its bonds.")
+    else:
+        return
+    raise PreparationError(f"AmberTools made parameters with {what} for scene {scene.name!r}; check its bonds.")
 
 
 def _rearranged(scene: Scene, pdb: Path) -> bool:
@@ -421,16 +358,12 @@ def announced(scene: Scene) -> Iterator[Callable[[float], None] | None]:
     lines are warnings of the logger 'surromd.charges': on stderr unless a program that uses this package decides else.
     """
     expected = expected_s(scene.n_atoms)
-    if expected < _EQUIVALENT_TIME_SAYING_S:
+    if expected < _WORTH_SAYING_S:
         yield None
         return
     about = format_wall(float(f"{expected:.1g}"))
-    _log.warning(
-        "%s: AM1-BCC charges of %d atoms, about %s on an idle core, once: they are kept in the cache",
-        scene.name,
-        scene.n_atoms,
-        about,
-    )
+    what = f"AM1-BCC charges of {scene.n_atoms} atoms, about {about} on an idle core, once: they are kept in the cache"
+    _log.warning("%s: %s", scene.name, what)
     on_terminal = sys.stderr.isatty() and _log.isEnabledFor(logging.WARNING)
     started = time.monotonic()
 
@@ -444,3 +377,133 @@ def announced(scene: Scene) -> Iterator[Callable[[float], None] | None]:
         if on_terminal:
             sys.stderr.write("\r\x1b[K")
     _log.warning("%s: charges computed in %s", scene.name, format_wall(time.monotonic() - started))
+
+
+# ---- prmtop files ----------------------------------------------------------------------------------------------------
+
+
+# (section, atoms in a record, numbers in a record); atom numbers are stored as 3 (i - 1).
+_TERMS = (("BONDS", 2, 3), ("ANGLES", 3, 4), ("DIHEDRALS", 4, 5))
+_PER_ATOM = (
+    "ATOM_NAME", "CHARGE", "ATOMIC_NUMBER", "MASS", "ATOM_TYPE_INDEX", "AMBER_ATOM_TYPE", "TREE_CHAIN_CLASSIFICATION",
+    "JOIN_ARRAY", "IROTAT", "RADII", "SCREEN",
+)  # fmt: skip
+# Amber's unit of charge: sqrt(kcal/mol Å) per elementary charge.
+CHARGE_UNIT = 18.2223
+
+
+class Prmtop:
+    """The sections of a prmtop file: `fields[name]` is a list of numbers or of strings, in the file's own units. Raises
+    InputError for text that is no prmtop of this kind (one molecule, no polarisability, no CMAP)."""
+
+    def __init__(self, text: str) -> None:
+        self.fields: dict[str, list[Any]] = {}
+        self._formats: dict[str, str] = {}
+        self._head = text.partition("%FLAG")[0]
+        for block in text.split("%FLAG")[1:]:
+            lines = [line for line in block.splitlines() if not line.startswith("%COMMENT")]
+            name, form = lines[0].strip(), lines[1].strip()
+            match = re.fullmatch(r"%FORMAT\((\d+)([aEIei])(\d+)(?:\.\d+)?\)", form)
+            if match is None:
+                raise InputError(f"prmtop section {name} has an unknown format {form}.")
+            width = int(match[3])
+            cells = [line[k : k + width] for line in lines[2:] for k in range(0, len(line.rstrip("\n")), width)]
+            kind = match[2].lower()
+            convert: Any = {"a": str.strip, "i": int, "e": float}[kind]
+            self.fields[name] = [convert(c) for c in cells if kind == "a" or c.strip()]
+            self._formats[name] = form
+        needed = {"POINTERS", "DIHEDRALS_INC_HYDROGEN", "EXCLUDED_ATOMS_LIST", *_PER_ATOM} - set(self.fields)
+        if needed:
+            raise InputError(f"not an AMBER prmtop file: it lacks {', '.join(sorted(needed))}.")
+        n = self.n_atoms
+        for name in _PER_ATOM:
+            self.fields[name] = self.fields[name][:n]
+            if len(self.fields[name]) != n:
+                raise InputError(f"prmtop section {name} has {len(self.fields[name])} entries for {n} atoms.")
+        if any("CMAP" in name for name in self.fields):
+            raise InputError("a prmtop file with CMAP terms cannot be reordered.")
+
+    @property
+    def n_atoms(self) -> int:
+        return int(self.fields["POINTERS"][0])
+
+    @property
+    def charges_e(self) -> FloatArray:
+        """Partial charges `(n_atoms,)` in elementary charges."""
+        return np.array(self.fields["CHARGE"], dtype=np.float64) / CHARGE_UNIT
+
+    @property
+    def bonds(self) -> set[tuple[int, int]]:
+        """Bonded pairs, i < j, from 0."""
+        flat = self.fields["BONDS_INC_HYDROGEN"] + self.fields["BONDS_WITHOUT_HYDROGEN"]
+        pairs = ((flat[k] // 3, flat[k + 1] // 3) for k in range(0, len(flat), 3))
+        return {(min(pair), max(pair)) for pair in pairs}
+
+    def permuted(self, order: IntArray) -> Prmtop:
+        """Return the same molecule with its atom k in place `order[k]`; every energy stays what it was."""
+        out = object.__new__(Prmtop)
+        out._head, out._formats = self._head, self._formats
+        out.fields = {name: list(values) for name, values in self.fields.items()}
+        to = [int(i) for i in order]
+        for name in _PER_ATOM:
+            for k, value in enumerate(self.fields[name]):
+                out.fields[name][to[k]] = value
+        for prefix, n_indices, width in _TERMS:
+            for suffix in ("_INC_HYDROGEN", "_WITHOUT_HYDROGEN"):
+                flat = out.fields[prefix + suffix]
+                for start in range(0, len(flat), width):
+                    flat[start : start + n_indices] = _moved(flat[start : start + n_indices], to)
+        out.fields["NUMBER_EXCLUDED_ATOMS"], out.fields["EXCLUDED_ATOMS_LIST"] = self._exclusions(to)
+        return out
+
+    def _exclusions(self, to: list[int]) -> tuple[list[int], list[int]]:
+        n = self.n_atoms
+        later: list[list[int]] = [[] for _ in range(n)]
+        partners = iter(self.fields["EXCLUDED_ATOMS_LIST"])
+        for i, count in enumerate(self.fields["NUMBER_EXCLUDED_ATOMS"]):
+            for _ in range(count):
+                j = next(partners)
+                if j > 0:
+                    a, b = sorted((to[i], to[j - 1]))
+                    later[a].append(b + 1)
+        # An atom without later partners still has one entry, a zero.
+        rows = [sorted(row) or [0] for row in later]
+        return [len(row) for row in rows], [j for row in rows for j in row]
+
+    def text(self) -> str:
+        """Return the file as text."""
+        parts = [self._head]
+        for name, values in self.fields.items():
+            form = self._formats[name]
+            match = re.fullmatch(r"%FORMAT\((\d+)([aEIei])(\d+)(?:\.(\d+))?\)", form)
+            assert match is not None
+            per_line, kind, width = int(match[1]), match[2].lower(), int(match[3])
+            spec = {"a": f"<{width}", "i": f">{width}", "e": f">{width}.{match[4]}E"}[kind]
+            cells = [format(v, spec) for v in values]
+            lines = ["".join(cells[k : k + per_line]) for k in range(0, len(cells), per_line)] or [""]
+            parts.append("\n".join([f"%FLAG {name:<74}", f"{form:<80}", *lines]) + "\n")
+        return "".join(parts)
+
+
+def _moved(indices: list[int], to: list[int]) -> list[int]:
+    """One term's stored atom numbers at their new places; the signs of a dihedral stay at its third and fourth atom.
+
+    A negative third number says that the 1-4 pair is counted elsewhere, a negative fourth that the term is improper.
+    Zero has no sign, so a dihedral whose third or fourth atom is the first of the file is written backwards.
+    """
+    new = [3 * to[abs(i) // 3] for i in indices]
+    if len(indices) < 4:
+        return new
+    if 0 in new[2:]:
+        new.reverse()
+    return new[:2] + [-i if old < 0 else i for i, old in zip(new[2:], indices[2:], strict=True)]
+
+
+def load_openmm(text: str) -> Any:
+    """Return OpenMM's own reader (`openmm.app.AmberPrmtopFile`) of a prmtop given as text."""
+    from openmm import app
+
+    with tempfile.TemporaryDirectory(prefix="surromd-") as folder:
+        path = Path(folder) / "molecule.prmtop"
+        path.write_text(text)
+        return app.AmberPrmtopFile(str(path))

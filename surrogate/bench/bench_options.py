@@ -1,22 +1,15 @@
-"""The settings that a benchmark of run time against error goes through, and what is the same for all."""
+"""Options of the benchmarks; light to import (`systems.options`)."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from itertools import product
-from typing import TYPE_CHECKING
+from dataclasses import dataclass
 
-from surrogate.verbs.options import Quiet
+from surrogate.verbs.options import Quiet, Seeded
 from systems.errors import InputError
 from systems.options import check_options, option
 
-if TYPE_CHECKING:
-    from surrogate.models.weights import Weights
-
 STEPS = (2, 3, 4, 6, 10, 20)
-# Ways of MD: OpenMM as it is set up here and as its manual does, and sixteen copies at once (`md_reference.simd`).
-OURS, PLAIN, SIMD = "ours", "plain", "simd"
 USUAL_BATCH = 32
 
 
@@ -76,36 +69,26 @@ class Sweep:
 
 @dataclass(frozen=True, kw_only=True)
 class CostErrorOptions(CostErrorConfig, Sweep, Quiet):
-    """What `bench cost-error` can be told: what is the same for all settings, and which settings."""
+    """Options of `bench cost-error`: what is the same for all settings, and which settings."""
 
 
-def choose_settings(weights: Weights, sweep: Sweep) -> list[Setting]:
-    """Return the settings to run. Without solvers those that take a batch at once.
+@dataclass(frozen=True, kw_only=True)
+class StressOptions(Seeded, Quiet):
+    """Options of `stress`."""
 
-    Where neither precisions nor batches are given, the usual solver at the usual steps is run in both precisions, alone
-    and in a batch; with `compiled` also compiled. Raises InputError for a solver that the weights do not know.
-    """
-    from surrogate.models.lam_slide.flow import ADAPTIVE
-    from surrogate.training.devices import choose_precision
-
-    known = weights.model.solvers
-    unknown = [name for name in sweep.solvers or () if name not in known]
-    if unknown:
-        raise InputError(f"{weights.path.name} knows no solver {unknown[0]!r}; choose {', '.join(known) or 'none'}.")
-    chosen: list[str | None] = [*(sweep.solvers or [name for name in known if name not in ADAPTIVE])] or [None]
-    own = weights.model.usual_steps
-    numbers = (sweep.steps or STEPS) if known else (own,)
-    found = [
-        Setting(solver, n, precision, batch)
-        for solver, n, precision, batch in product(
-            chosen, numbers, sweep.precisions or ("auto",), sweep.batches or (USUAL_BATCH,)
-        )
-    ]
-    usual = Setting(chosen[0], own if own in numbers else max(numbers))
-    if not (sweep.precisions or sweep.batches):
-        with_bf16 = choose_precision("auto", suits=weights.model.float32_layers is not None).bf16
-        found += [replace(usual, precision="fp32" if with_bf16 else "bf16")]
-        found += [replace(usual, batch=1)]
-    if sweep.compiled:
-        found += [replace(usual, compile=True)]
-    return list(dict.fromkeys(found))
+    frames: Sequence[int] | None = option(
+        "Rollout length in frames, all replicas together; repeatable.", None, within=(1, None), unset="10000 and 100000"
+    )
+    replicas: int | None = option("Number of rollout replicas.", None, within=(1, None), unset="16")
+    guards: Sequence[str] | None = option(
+        "Guard policy of the rollouts; repeatable.", None, words=("guard",), unset="flag and repair"
+    )
+    sections: Sequence[str] | None = option(
+        "Test to run: length, invariance, inputs, precision, batches, solvers, openmm; repeatable.",
+        None,
+        words=("section",),
+    )
+    scene: str | None = option(
+        "Scene to test, for weights of several peptides, such as sequence:ACE-LEU-SER-NME.", None
+    )
+    quick: bool = option("Short runs: a minute or two.", False)
