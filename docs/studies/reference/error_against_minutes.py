@@ -30,11 +30,12 @@ import surrogate as sm
 from md_reference.run.machine import machine_name
 from md_reference.run.replicas import simulate_replicas
 from md_reference.simd.force_field import n_replicas
-from surrogate.comparison.convergence import angles_of, find_wells, tested_reference
+from surrogate.comparison.convergence import angles_of, tested_reference
 from surrogate.comparison.equivalent_time import EquivalentTime
 from surrogate.comparison.md_answer import Answer, md_answer
 from surrogate.comparison.measure.distributions import distance
 from surrogate.comparison.measure.structure import Baseline
+from surrogate.comparison.measure.torsions import find_wells
 from surrogate.comparison.read.ensemble import Ensemble, load_ensemble
 from surrogate.verbs.options import ReferenceOptions
 from surrogate.verbs.reference import resolve_run
@@ -192,7 +193,7 @@ def energy_error(ref: Angles, other: Angles, weights: Sequence[FloatArray] | Non
     """Return the root mean square error of free energies of the states of every torsion, kJ/mol."""
     rt, squares = GAS_CONSTANT_KJ_MOL_K * KELVIN, []
     for name, segments in ref.items():
-        wells = find_wells(name, segments)
+        wells = find_wells(segments)
         if len(wells.names) < 2:
             continue
         shares = []

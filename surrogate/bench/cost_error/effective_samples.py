@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 from surrogate.bench.cost_error.sweep_settings import SIMD
-from surrogate.comparison.rows.relaxation_rows import relaxation_of, turning
+from surrogate.comparison.rows.kinetics_rows import relaxation_of, turning
 
 if TYPE_CHECKING:
     from surrogate.comparison.rows.rows import Sample
