@@ -22,14 +22,14 @@ from surrogate.comparison.equivalent_time import (
     distance_to_reference,
     equivalent_time_by,
     errors_by_length,
+    joint_measure,
 )
-from surrogate.comparison.equivalent_time_measures import joint_measure
 from surrogate.comparison.measure.distributions import block_occupancy
 from surrogate.comparison.measure.slow_motion import longest_correlation
 from surrogate.comparison.measure.statistics import block_length, estimate, make_blocks
 from surrogate.comparison.measure.structure import Baseline, Features, backbone
 from surrogate.comparison.read.ensemble import Ensemble, load_ensemble
-from surrogate.comparison.rows.relaxation_rows import relaxation_of, turning
+from surrogate.comparison.rows.kinetics_rows import relaxation_of, turning
 from surrogate.comparison.rows.rows import Options, Sample, make_sample
 from systems.chemistry.validity import BOND_20_PERCENT, INVALID, NOT_FINITE
 from systems.errors import InputError

@@ -7,16 +7,16 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 
-from surrogate.comparison import input_notes, verdict
+from surrogate.comparison import verdict
 from surrogate.comparison.convergence import NOTHING_OPEN, Convergence, Explained, convergence_of, explain
-from surrogate.comparison.equivalent_time import EquivalentTime, equivalent_time_charts, headline
-from surrogate.comparison.equivalent_time_measures import equivalent_times
-from surrogate.comparison.input_notes import bonds_that_are_none, copied_from, jumps, refuse_wrong_topology
+from surrogate.comparison.equivalent_time import EquivalentTime, equivalent_time_charts, equivalent_times, headline
 from surrogate.comparison.measure.movie import Movie, make_movie
 from surrogate.comparison.measure.slow_motion import longest_correlation
 from surrogate.comparison.measure.statistics import block_length, effective_samples, make_blocks
-from surrogate.comparison.measure.structure import Backbone, Baseline, Features, first_invalid_ps
+from surrogate.comparison.measure.structure import Backbone, Baseline, Features
+from surrogate.comparison.measure.torsions import bond_label
 from surrogate.comparison.metrics import METRICS, measure_all
 from surrogate.comparison.read.ensemble import Ensemble, alike
 from surrogate.comparison.rows.charts import Chart, jsonable
@@ -25,20 +25,28 @@ from surrogate.comparison.rows.torsion_rows import FEW_RESIDUES
 from surrogate.comparison.rows.validity_rows import (
     EnergyFn,
     applicable_checks,
+    copied_from,
     measure_energies,
     places_in_chunk,
 )
-from surrogate.comparison.verdict import in_short
 from systems.chemistry import validity
+from systems.chemistry.element_data import covalent_radius_nm
 from systems.chemistry.validity import Geometry
 from systems.errors import InputError
 from systems.scene import Scene
+from systems.units import format_time_ps
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-# Frames whose bonds tell whether a topology fits.
+# Frames whose bonds show whether a topology fits.
 _FRAMES_FOR_BONDS = 20
+# Longer than so many times the sum of covalent radii no bond is, not even to a metal.
+_LONGEST_BOND = 1.4
+# Bonds that are none, number and share, of which a reference is refused.
+_REFUSED = (3, 0.05)
+# Jumps: so many times as long as all but one step in a thousand, and no more of them than this.
+_JUMP_TIMES, _USUAL, _MOST_JUMPS = 3.0, 0.999, 20
 _MIN_FRAMES = 20
 # Holm's correction for so many rows must leave the least p-value of a permutation test below 5 %.
 _ROWS_FORESEEN = 60
@@ -89,10 +97,11 @@ class Evaluation:
     `compared_ps` and `n_frames` are the equal length of all three; `block_ps` and `n_blocks` (of the reference) stand
     behind the error bars; `correlation_ps` is the integrated autocorrelation time of the slowest motion in reference
     and replicate; `effective_samples` are the independent ones that the equal length holds of the slowest motion of any
-    of the three; `speed_ratio` is simulated time per wall second over the reference's.
-    `worth` says by each measure how much MD the whole candidate is worth, and `equivalent_time_words` says it in a
-    sentence (empty where it cannot be told, or frames are broken, or the reference still depends on where it started).
-    `left_open`: what the reference's start or length leaves open; `in_short`: use it or not, for what, why.
+    of the three; `speed_ratio` is simulated time per wall second over the reference's; `faults` of (reference,
+    candidate, replicate). `equivalent_time` says by each measure how much MD the whole candidate is worth, and
+    `equivalent_time_words` says it in a sentence (empty where it is not known, or frames are broken, or the reference
+    still depends on where it started). `left_open`: what the reference's start or length leaves open; `in_short`: use
+    it or not, for what, why.
     """
 
     summary: Summary
@@ -161,13 +170,29 @@ class Comparison:
     def plot(self) -> Figure:
         """Return a matplotlib figure: free energy over φ and ψ of reference, replicate and each candidate, a row a
         residue; where there is no backbone, its torsions' histograms."""
-        from surrogate.comparison.report.overview import overview
+        from surrogate.comparison.report.figures import overview
 
         return overview([(j.summary.label, j.charts) for j in self.evaluations], self.temperature_k)
 
     def to_dict(self) -> dict[str, Any]:
         """Return JSON-able values of all but the movies; what is not finite becomes None."""
         return {name: jsonable(value) for name, value in vars(self).items() if name != "movies"}
+
+
+class _Setting(NamedTuple):
+    """What all candidates of a comparison have in common; `known`: all MD of the reference's simulation."""
+
+    scene: Scene
+    torsions: Backbone
+    geometry: Geometry
+    reference: Features
+    replicate: Features
+    options: Options
+    temperature_k: float
+    summary: Summary
+    recipes: dict[int, Any]
+    known: tuple[Features, ...]
+    convergence: Convergence
 
 
 def compare(
@@ -191,107 +216,77 @@ def compare(
     """
     if not candidates:
         raise InputError("Nothing to compare with the reference: give at least one trajectory.")
-    chosen = options or Options()
-    stage = scene or reference.scene
+    options = options or Options()
+    whole = scene or reference.scene
     everyone = [reference, *candidates, *([] if replicate is None else [replicate])]
     thinned, kept = alike(everyone)
     # Torsions and rings are found in the whole molecule; only hydrogens or side chains may be missing.
-    whole, stage = stage, stage if kept is None else thinned[0].scene
+    stage = whole if kept is None else thinned[0].scene
     for ensemble in thinned:
         if ensemble.scene.elements != stage.elements:
             raise InputError(f"{ensemble.label}: its atoms are not those of {stage.name!r} in the same order.")
-    replicate_baseline = None if replicate is None else thinned[-1]
-    for ensemble in thinned[:1] if replicate_baseline is None else (thinned[0], replicate_baseline):
-        refuse_wrong_topology(ensemble.label, stage, ensemble.sample(_FRAMES_FOR_BONDS))
-    baseline = Baseline.of(thinned[0], parent=whole, kept=kept)
+    n = len(candidates)
+    ref, rolled, rep = thinned[0], thinned[1 : 1 + n], None if replicate is None else thinned[-1]
+    for ensemble in (ref,) if rep is None else (ref, rep):
+        _refuse_wrong_topology(ensemble.label, stage, ensemble.sample(_FRAMES_FOR_BONDS))
+    baseline = Baseline.of(ref, parent=whole, kept=kept)
     measured = [baseline.measure(e) for e in thinned]
     if energy_fn is not None and kept is None:
         measured = [
             replace(m, energy_kj=measure_energies(e, energy_fn)) for m, e in zip(measured, thinned, strict=True)
         ]
     notes = [note for e in thinned for note in e.notes]
-    for rolled in thinned[1 : 1 + len(candidates)]:
-        long, said = bonds_that_are_none(stage, rolled.sample(_FRAMES_FOR_BONDS))
-        notes += [f"{rolled.label}: {said}; does its topology fit its coordinates?"] if long else []
-    notes += jumps(measured)
-    ref = measured[0]
-    known = (ref,) if replicate is None else (ref, measured[-1])
-    convergence = convergence_of(known, baseline.torsions, seed=chosen.seed)
+    for ensemble in rolled:
+        long, said = _bonds_that_are_none(stage, ensemble.sample(_FRAMES_FOR_BONDS))
+        notes += [f"{ensemble.label}: {said}; does its topology fit its coordinates?"] if long else []
+    notes += [note for features in measured for note in _jump_notes(features)]
+    known = (measured[0],) if rep is None else (measured[0], measured[-1])
+    convergence = convergence_of(known, baseline.torsions, seed=options.seed)
     if not convergence.converged:
         remedy = convergence.remedy
         notes.append(f"The reference is {convergence.verdict} {remedy[:1].upper()}{remedy[1:]}.")
-    if replicate is None:
-        half = ref.n_frames // 2
-        other = replace(ref.frames(half, 2 * half), label=f"{ref.label} (second half)")
-        ref = replace(ref.frames(0, half), label=f"{ref.label} (first half)")
+    first, second = known[0], known[-1]
+    if rep is None:
+        half = first.n_frames // 2
+        second = replace(first.frames(half, 2 * half), label=f"{first.label} (second half)")
+        first = replace(first.frames(0, half), label=f"{first.label} (first half)")
         notes.append(
-            f"No replicate was given: the reference is cut in two halves of {ref.length_words}; the "
+            f"No replicate was given: the reference is cut in two halves of {first.length_words}; the "
             "candidates are compared with the first, and the second is the replicate."
         )
-    else:
-        other = measured[-1]
-    temperature = reference.record.get("temperature_k")
-    if not isinstance(temperature, (int, float)):
-        temperature = 300.0
+    temperature_k = reference.record.get("temperature_k")
+    if not isinstance(temperature_k, (int, float)):
+        temperature_k = 300.0
         notes.append("The reference does not state its temperature; free energies are drawn for 300 K.")
     summaries = [summary_of(e) for e in everyone]
     setting = _Setting(
-        stage,
-        baseline.torsions,
-        baseline.geometry,
-        ref,
-        other,
-        chosen,
-        float(temperature),
-        summaries[0],
-        {},
-        known,
-        convergence,
-    )
-    evaluations = tuple(
-        _comparison(setting, features, summary, (thinned[0], rolled, replicate_baseline))
-        for features, summary, rolled in zip(
-            measured[1:], summaries[1:], thinned[1 : 1 + len(candidates)], strict=False
-        )
-    )
+        stage, baseline.torsions, baseline.geometry, first, second, options, float(temperature_k), summaries[0], {},
+        known, convergence,
+    )  # fmt: skip
+    own = list(zip(measured[1 : 1 + n], summaries[1 : 1 + n], rolled, strict=True))
+    evaluations = tuple(_evaluate(setting, m, summary, (ref, e, rep)) for m, summary, e in own)
     notes += [f"Validity check left out: {x}." for x in baseline.geometry.excluded]
     return Comparison(
         scene_name=stage.name,
         formula=stage.formula,
         n_atoms=stage.n_atoms,
-        temperature_k=float(temperature),
-        lag_ps=thinned[0].lag_ps,
+        temperature_k=float(temperature_k),
+        lag_ps=ref.lag_ps,
         reference=summaries[0],
         replicate=None if replicate is None else summaries[-1],
         evaluations=evaluations,
         notes=tuple(dict.fromkeys(notes)),
-        options=chosen,
+        options=options,
         versions=_versions(),
         convergence=convergence,
         movies=tuple(
-            make_movie(thinned[0], rolled, measured[0], features, evaluation.n_frames)
-            for rolled, features, evaluation in zip(thinned[1:], measured[1:], evaluations, strict=False)
+            make_movie(ref, e, measured[0], features, evaluation.n_frames)
+            for (features, _, e), evaluation in zip(own, evaluations, strict=True)
         ),
     )
 
 
-class _Setting(NamedTuple):
-    """What all candidates of a comparison have in common."""
-
-    scene: Scene
-    torsions: Backbone
-    geometry: Geometry
-    reference: Features
-    replicate: Features
-    options: Options
-    temperature_k: float
-    summary: Summary
-    recipes: dict[int, Any]
-    known: tuple[Features, ...]
-    convergence: Convergence
-
-
-def _comparison(
+def _evaluate(
     setting: _Setting, candidate: Features, summary: Summary, trajectories: tuple[Ensemble, Ensemble, Ensemble | None]
 ) -> Evaluation:
     """Evaluate one candidate; `summary`: what its file says of it; `trajectories`: see `ComparisonInput`."""
@@ -299,64 +294,53 @@ def _comparison(
     inputs = replace(inputs, trajectories=trajectories)
     reference, replicate, options = setting.reference, setting.replicate, setting.options
     found_rows, charts, skipped = measure_all(METRICS, inputs)
-    n_compared = round(inputs.compared_ps / inputs.reference.features.lag_ps)
-    samples = effective_samples(n_compared, correlation)
-    every = list(found_rows)
+    n_compared = round(inputs.compared_ps / inputs.lag_ps)
     left_open = explain(setting.known, candidate, setting.torsions, setting.convergence, seed=options.seed)
-    if samples < input_notes.LEAST_FOR_TESTS or left_open.why:
-        every = verdict.untested(every, start=bool(left_open.why))
-    every = by_group([*every, *(x.row() for x in left_open.excess)])
-    evaluated = verdict.evaluated_rows(every, options)
-    found = verdict.findings(evaluated)
-    ref = inputs.reference
-    cautions = input_notes.cautions(inputs, max(correlation, own), left_open.in_words(setting.convergence))
-    kind = verdict.status(evaluated, cautions)
+    if effective_samples(n_compared, correlation) < verdict.LEAST_FOR_TESTS or left_open.why:
+        found_rows = verdict.untested(found_rows, start=bool(left_open.why))
+    rows = verdict.evaluated_rows(by_group([*found_rows, *(x.row() for x in left_open.excess)]), options)
+    found = verdict.findings(rows)
+    slowest = max(correlation, own)
+    cautions = verdict.cautions_of(inputs, slowest, left_open.in_words(setting.convergence))
+    status = verdict.status(rows, cautions)
     # By a reference that may be elsewhere than MD ends, nothing is worth a length of MD.
-    equivalent_time = (
-        () if left_open.why else equivalent_times(reference, candidate, replicate, setting.torsions, options)
-    )
-    words = ""
-    shortest = min((s.features for s in inputs.samples), key=lambda f: f.total_ps)
+    times = () if left_open.why else equivalent_times(reference, candidate, replicate, setting.torsions, options)
     known = effective_samples(min(reference.n_frames, replicate.n_frames), correlation)
-    if (
-        equivalent_time
-        and kind != "broken"
-        and not (cautions.apart or cautions.copied)
-        and known >= input_notes.LEAST_FOR_EQUIVALENT_TIME
-    ):
-        words = _equivalent_time_words(equivalent_time, summary, setting.summary)
+    words = ""
+    if status != "broken" and not (cautions.apart or cautions.copied) and known >= verdict.LEAST_FOR_EQUIVALENT_TIME:
+        words = headline(
+            times, lambda w: cost_ratio(w.equivalent_ps, w.share, summary, setting.summary), summary.total_ps
+        )
+    shortest = min((s.features for s in inputs.samples), key=lambda f: f.total_ps)
+    said = verdict.sentence(rows, found, shortest.length_words, cautions)
+    faults = [_faults_of(s, setting.geometry) for s in inputs.samples]
+    blocks = inputs.reference.blocks
     return Evaluation(
         summary=summary,
-        status=kind,
-        verdict=" ".join(
-            [verdict.sentence(evaluated, found, shortest.length_words, cautions), *([words] if words else [])]
-        ),
+        status=status,
+        verdict=f"{said} {words}".rstrip(),
         findings=found,
-        rows=evaluated,
+        rows=rows,
         compared_ps=inputs.compared_ps,
         n_frames=min(s.features.n_frames for s in inputs.samples),
-        block_ps=ref.blocks.n_frames_each * ref.features.lag_ps,
-        n_blocks=ref.blocks.n_blocks,
-        correlation_ps=correlation * ref.features.lag_ps,
-        effective_samples=effective_samples(n_compared, max(correlation, own)),
+        block_ps=blocks.n_frames_each * inputs.lag_ps,
+        n_blocks=blocks.n_blocks,
+        correlation_ps=correlation * inputs.lag_ps,
+        effective_samples=effective_samples(n_compared, slowest),
         speed_ratio=speed_ratio(summary, setting.summary),
-        faults=(
-            faults_of(inputs.reference, setting.geometry),
-            faults_of(inputs.candidate, setting.geometry),
-            faults_of(inputs.replicate, setting.geometry),
+        faults=(faults[0], faults[1], faults[2]),
+        skipped=tuple(skipped),
+        notes=(
+            *_trimming(inputs, reference, candidate, replicate),
+            *(["Equivalent MD time is withheld: it takes a converged reference."] if left_open.why else []),
+            *verdict.unlike(rows, options),
+            *copied_from(inputs)[1],
         ),
-        skipped=(*input_notes.skipped(inputs), *skipped),
-        notes=tuple(
-            input_notes.trimming(inputs, reference, candidate, replicate)
-            + (["Equivalent MD time is withheld: it takes a converged reference."] * bool(left_open.why))
-            + input_notes.unlike(evaluated, options)
-            + copied_from(inputs)[1]
-        ),
-        charts=(*equivalent_time_charts(equivalent_time), *charts),
-        equivalent_time=equivalent_time,
+        charts=(*equivalent_time_charts(times), *charts),
+        equivalent_time=times,
         equivalent_time_words=words,
         left_open=left_open,
-        in_short=in_short(evaluated, kind, found, cautions, words),
+        in_short=verdict.in_short(rows, status, found, cautions, words),
     )
 
 
@@ -380,17 +364,71 @@ def _equal_terms(setting: _Setting, candidate: Features) -> tuple[ComparisonInpu
     each = block_length(n, max(slowest, own))
     n_rows = _ROWS_FORESEEN + 8 * min(len(torsions.phi) + len(torsions.psi), 2 * FEW_RESIDUES)
     options = replace(setting.options, n_permutations=max(setting.options.n_permutations, 50 * n_rows))
-    ref, rolled, other = (
-        make_sample(f, make_blocks(f.segment_lengths, each), options, stream, n) for stream, f in enumerate(cut)
-    )
+    samples = [make_sample(f, make_blocks(f.segment_lengths, each), options, stream, n) for stream, f in enumerate(cut)]
     inputs = ComparisonInput(
-        setting.scene, torsions, setting.geometry, ref, rolled, other, options, setting.temperature_k, setting.recipes
-    )
+        setting.scene, torsions, setting.geometry, samples[0], samples[1], samples[2], options, setting.temperature_k,
+        setting.recipes,
+    )  # fmt: skip
     return inputs, slowest, own
 
 
-def _equivalent_time_words(found: Sequence[EquivalentTime], summary: Summary, reference: Summary) -> str:
-    return headline(found, lambda w: cost_ratio(w.equivalent_ps, w.share, summary, reference), summary.total_ps)
+def _trimming(inputs: ComparisonInput, *trajectories: Features) -> list[str]:
+    """Return which trajectories are longer than the equal length at which distances are taken."""
+    return [
+        f"{f.label}: the first {f.frames(0, round(inputs.compared_ps / f.lag_ps)).length_words} of {f.length_words} "
+        "are used for the distances, at equal length; all of it for the tests."
+        for f in trajectories
+        if f.total_ps > inputs.compared_ps
+    ]
+
+
+def _refuse_wrong_topology(label: str, scene: Scene, frames: npt.NDArray[np.float32]) -> None:
+    """Raise InputError where frames of a reference have bonds that are none: its topology does not fit them."""
+    long, words = _bonds_that_are_none(scene, frames)
+    if long >= _REFUSED[0] and long >= _REFUSED[1] * len(scene.bonds):
+        raise InputError(
+            f"{label}: {words}. The topology does not fit the coordinates, whose atoms are in another order; "
+            "name the one that belongs to them with `top`."
+        )
+
+
+def _bonds_that_are_none(scene: Scene, frames: npt.NDArray[np.float32]) -> tuple[int, str]:
+    """Return how many bonds are longer, in the median of frames `(n, n_atoms, 3)` nm, than any bond between such
+    elements is, and say so."""
+    if scene.interactions is not None or not len(scene.bonds) or not len(frames):
+        return 0, ""
+    i, j = scene.bonds.T
+    length = np.median(np.linalg.norm(frames[:, i] - frames[:, j], axis=-1), axis=0)
+    try:
+        radii = np.array([covalent_radius_nm(e) for e in scene.elements])
+    except KeyError:  # virtual sites have no size
+        return 0, ""
+    long = np.flatnonzero(length > _LONGEST_BOND * (radii[i] + radii[j]))
+    if not len(long):
+        return 0, ""
+    worst = int(long[np.argmax(length[long])])
+    name = bond_label(scene, int(i[worst]), int(j[worst]))
+    return len(long), f"{len(long)} of {len(length)} bonds are no bonds, such as {name} of {10 * length[worst]:.2g} Å"
+
+
+def _jump_notes(features: Features) -> list[str]:
+    """Return where a trajectory jumps: steps of the whole molecule three times as long as one in a thousand is."""
+    if features.moved_nm is None:
+        return []
+    steps = np.concatenate([m[np.isfinite(m)] for m in features.moved_nm])
+    if len(steps) < 1 / (1 - _USUAL):
+        return []
+    limit = _JUMP_TIMES * float(np.quantile(steps, _USUAL))
+    places = [(k, int(f)) for k, m in enumerate(features.moved_nm) for f in np.flatnonzero(np.nan_to_num(m) > limit)]
+    if not 0 < len(places) <= _MOST_JUMPS:
+        return []
+    segment, frame = places[0]
+    where = format_time_ps(frame * features.lag_ps) + (f" of segment {segment + 1}" if segment else "")
+    times = "once" if len(places) == 1 else f"{len(places)} times"
+    return [
+        f"{features.label}: the molecule jumps {times} from one frame to the next (first at {where}): were files "
+        "joined there? Give them as replicas, or with their times."
+    ]
 
 
 def _versions() -> dict[str, str]:
@@ -405,29 +443,25 @@ def _versions() -> dict[str, str]:
     return found
 
 
-def faults_of(sample: Sample, geometry: Geometry) -> Faults:
-    """Count the flags of the frames of one sample, of those checks that the geometry has something for."""
+def _faults_of(sample: Sample, geometry: Geometry) -> Faults:
+    """Count the flags of the frames of one sample, of those checks that the geometry has something for; the first
+    invalid frame by its time in its segment."""
     features = sample.features
     flags = np.concatenate(list(features.flags))
     counts = {validity.flag_names(c.mask)[0]: int(((flags & c.mask) != 0).sum()) for c in applicable_checks(geometry)}
-    return Faults(
-        features.label,
-        len(flags),
-        counts,
-        int(((flags & validity.INVALID) != 0).sum()),
-        first_invalid_ps(features, validity.INVALID),
-        int((places_in_chunk(features) == 0).sum()),
-    )
+    invalid = [(f & validity.INVALID) != 0 for f in features.flags]
+    first_ps = min((int(np.argmax(f)) * features.lag_ps for f in invalid if f.any()), default=None)
+    n_invalid, n_chunks = sum(int(f.sum()) for f in invalid), int((places_in_chunk(features) == 0).sum())
+    return Faults(features.label, len(flags), counts, n_invalid, first_ps, n_chunks)
 
 
 def summary_of(ensemble: Ensemble) -> Summary:
     """Return what `ensemble` says of itself; simulated time and wall seconds are those of the whole input."""
     record = ensemble.record
-    cost = record.get("cost") if isinstance(record.get("cost"), dict) else {}
-    assert isinstance(cost, dict)
+    cost = record.get("cost")
+    cost = dict(cost) if isinstance(cost, dict) else {}
     wall = cost.get("wall_s")
     wall_s = float(wall) if isinstance(wall, (int, float)) and wall > 0 else None
-    settings = {k: v for k, v in record.items() if k != "cost" and isinstance(v, (str, int, float, bool))}
     return Summary(
         label=ensemble.label,
         sources=ensemble.sources,
@@ -437,10 +471,10 @@ def summary_of(ensemble: Ensemble) -> Summary:
         n_frames=ensemble.n_frames,
         lag_ps=ensemble.lag_ps,
         total_ps=ensemble.total_ps,
-        settings=settings,
+        settings={k: v for k, v in record.items() if k != "cost" and isinstance(v, (str, int, float, bool))},
         wall_s=wall_s,
         ns_per_day=None if wall_s is None else ensemble.total_ps * 1e-3 * 86_400.0 / wall_s,
-        cost=dict(cost),
+        cost=cost,
         length=ensemble.length_words,
     )
 

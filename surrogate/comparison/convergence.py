@@ -15,21 +15,16 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-import numpy.typing as npt
 
 from surrogate.comparison.measure import kinetics
-from surrogate.comparison.measure.probes import evenly
 from surrogate.comparison.measure.slow_motion import tic_0
-from surrogate.comparison.measure.statistics import Estimate
-from surrogate.comparison.measure.structure import Backbone, Baseline, Features
-from surrogate.comparison.measure.torsions import Segments, Wells, find_wells
+from surrogate.comparison.measure.statistics import Estimate, FloatArray, Segments
+from surrogate.comparison.measure.structure import Backbone, Baseline, Features, evenly
+from surrogate.comparison.measure.torsions import Wells, find_wells
 from surrogate.comparison.read.ensemble import Ensemble, length_words
 from surrogate.comparison.rows.rows import Row
 from systems.scene import Scene
 from systems.units import format_time_ps
-
-FloatArray = npt.NDArray[np.float64]
-IntArray = npt.NDArray[np.int64]
 
 # A replica shorter than so many relaxation times remembers its start, whatever the starts are.
 LEAST_RELAXATIONS = 5.0
@@ -216,7 +211,7 @@ def state_columns(
     columns = []
     found = angles_of(features, torsions) if features else []
     for k, (name, segments) in enumerate(found):
-        well = find_wells(name, segments) if wells is None else wells[k]
+        well = find_wells(segments) if wells is None else wells[k]
         if len(well.names) < 2:
             continue
         assigned = well.assign(segments)
@@ -464,17 +459,22 @@ class Excess:
 
         s = self.state
         beyond = max(self.low - self.share, self.share - self.high)
-        p = float(2.0 * ndtr(-beyond / max(self.error, 1e-6)))
-        allowed = f"{100 * self.low:.2g} to {100 * self.high:.2g}"
-        own = Estimate(100 * self.share, 100 * (self.share - 2 * self.error), 100 * (self.share + 2 * self.error),
-                       100 * self.error)  # fmt: skip
-        ref = Estimate(100 * s.share, 100 * self.low, 100 * self.high, 100 * s.error)
+        low, high = 100 * (self.share - 2 * self.error), 100 * (self.share + 2 * self.error)
         return Row(
-            f"allowed:{s.label}", "populations", f"Share of {s.label}, against what the reference allows", "%",
-            "observable", ref, own, None, None, p, 1.0, 100 * _TOLERANCE, "± 5 points",
-            f"{s.label} is held {100 * self.share:.3g} % of the time, where the reference allows {allowed} %, whatever "
-            "it has not converged in",
-        )  # fmt: skip
+            key=f"allowed:{s.label}",
+            group="populations",
+            metric=f"Share of {s.label}, against what the reference allows",
+            unit="%",
+            form="observable",
+            reference=Estimate(100 * s.share, 100 * self.low, 100 * self.high, 100 * s.error),
+            candidate=Estimate(100 * self.share, low, high, 100 * self.error),
+            p_value=float(2.0 * ndtr(-beyond / max(self.error, 1e-6))),
+            p_replicate=1.0,
+            tolerance=100 * _TOLERANCE,
+            tolerance_text="± 5 points",
+            statement=f"{s.label} is held {100 * self.share:.3g} % of the time, where the reference allows "
+            f"{100 * self.low:.2g} to {100 * self.high:.2g} %, whatever it has not converged in",
+        )
 
 
 @dataclass(frozen=True)
@@ -510,7 +510,7 @@ def explain(
     if not theirs or not own:
         return Explained(found.reasons)
     pairs = zip(angles_of(theirs, torsions), angles_of(own, torsions), strict=True)
-    wells = [find_wells(name, a, b) for (name, a), (_, b) in pairs]
+    wells = [find_wells(a, b) for (_, a), (_, b) in pairs]
     references, mine = state_columns(theirs, torsions, wells), state_columns(own, torsions, wells)
     total_ps = sum(f.total_ps for f in theirs)
     unseen, outside = [], [np.zeros(len(x), dtype=np.bool_) for x in mine[0].series] if mine else []

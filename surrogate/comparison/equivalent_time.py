@@ -1,5 +1,5 @@
 """How many nanoseconds of MD a candidate is worth: the length at which MD is as far from the reference as the
-candidate is.
+candidate is, by histograms of torsions and of TIC 0, bonds, autocorrelation.
 
 Reference and replicate are one simulation, run twice. Pieces of the one, of every length, are held against the whole
 of the other, and so is the candidate; both stand against the same reference, so its own noise is in both.
@@ -13,18 +13,39 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-import numpy.typing as npt
 
-from surrogate.comparison.measure.statistics import Estimate, bootstrap_weights, estimate
+from surrogate.comparison.measure import distributions, kinetics
+from surrogate.comparison.measure.distributions import TORSION_BINS, Bins
+from surrogate.comparison.measure.slow_motion import longest_correlation, slow_torsions, tica_features
+from surrogate.comparison.measure.statistics import (
+    Blocks,
+    Estimate,
+    FloatArray,
+    Piece,
+    Segments,
+    block_length,
+    bootstrap_weights,
+    estimate,
+    make_blocks,
+)
+from surrogate.comparison.measure.structure import MOST_HISTOGRAMS, Backbone, Features, evenly
 from surrogate.comparison.rows.charts import Line, LineChart
+from surrogate.comparison.rows.kinetics_rows import turning
+from surrogate.comparison.rows.rows import Options
+from surrogate.comparison.rows.torsion_rows import MOST_MAPS, joint_counts
 from systems.units import format_time_ps
 
-FloatArray = npt.NDArray[np.float64]
 Kind = Literal["distribution", "kinetics"]
+# (reference, candidate, replicate): features and their blocks.
+Three = Sequence[tuple[Features, Blocks]]
 
 _MANY_PIECES = 8
 _UNITS = (("us", 1e6), ("ns", 1e3), ("ps", 1.0))
 _NORMAL_95 = 1.959964
+# Pieces run from the whole length down to this share of it, halving each time.
+SHORTEST_SHARE = 128
+_LEAST_FRAMES = 10
+_LAGS = 40
 
 
 @dataclass(frozen=True)
@@ -91,18 +112,27 @@ class Measure:
     sums: tuple[FloatArray, FloatArray, FloatArray]
     squared: Callable[[FloatArray, FloatArray], FloatArray]
 
+    def to_references(self, sums: FloatArray) -> FloatArray:
+        """Return the squared distances `(n,)` of sums `(n, n_sums)`, the mean over reference and replicate."""
+        ends = (self.sums[0].sum(0), self.sums[2].sum(0))
+        return np.asarray(np.mean([self.squared(sums, end) for end in ends], axis=0))
+
+    def own_draws(self, seed: int, n_draws: int) -> FloatArray:
+        """Return the candidate's squared distance in every bootstrap draw of its blocks, `(n_draws,)`."""
+        own = self.sums[1]
+        return self.to_references(bootstrap_weights(len(own), n_draws, np.random.default_rng([seed, 7])) @ own)
+
 
 def errors_by_length(measure: Measure, length_ps: float) -> tuple[FloatArray, FloatArray]:
     """Return how far parts of the candidate of every length are from the reference: lengths in ps and distances, both
     `(n,)`, ascending; the candidate is `length_ps` long. As for MD in `equivalent_time_by`: geometric means over the
     parts.
     """
-    first, own, second = measure.sums
+    own = measure.sums[1]
     lengths, found = [], []
     n_each = 1
     while n_each <= len(own):
-        parts = _pieces(own, n_each)
-        errors = np.mean([measure.squared(parts, reference.sum(0)) for reference in (first, second)], axis=0)
+        errors = measure.to_references(_pieces(own, n_each))
         logs = np.log(errors[np.isfinite(errors) & (errors > 0)])
         if len(logs):
             lengths.append(length_ps * n_each / len(own))
@@ -114,9 +144,9 @@ def errors_by_length(measure: Measure, length_ps: float) -> tuple[FloatArray, Fl
 def distance_to_reference(measure: Measure, seed: int = 0, n_draws: int = 400) -> Estimate:
     """Return the candidate's distance to the reference (the root mean square of those to reference and replicate) with
     its 95 % interval: block bootstrap of the candidate alone, of the squared distance."""
-    own, references = measure.sums[1], (measure.sums[0].sum(0), measure.sums[2].sum(0))
-    value = float(np.mean([measure.squared(own.sum(0)[None], reference)[0] for reference in references]))
-    squared = estimate(value, _own_draws(measure, references, seed, n_draws), len(own))
+    own = measure.sums[1]
+    value = float(measure.to_references(own.sum(0)[None])[0])
+    squared = estimate(value, measure.own_draws(seed, n_draws), len(own))
     low, high = (math.sqrt(max(x, 0.0)) if math.isfinite(x) else math.nan for x in (squared.low, squared.high))
     return Estimate(math.sqrt(value), low, high, (high - low) / (2 * _NORMAL_95), n_blocks=len(own))
 
@@ -130,16 +160,15 @@ def equivalent_time_by(measure: Measure, length_ps: float, seed: int = 0, n_draw
     interval combines the error of that mean with the candidate's own: its block bootstrap, or the scatter of MD pieces
     of such a time where that is larger, because no trajectory knows by itself which states it has missed.
     """
+    from scipy.optimize import isotonic_regression
+
     first, own, second = measure.sums
     n_blocks = len(first)
-    references = (first.sum(0), second.sum(0))
     lengths, means, scatter, spans, counts = [], [], [], [], []
     n_each = 1
     while n_each <= n_blocks:
-        found = []
-        for blocks, reference in ((second, references[0]), (first, references[1])):
-            found.append(measure.squared(_pieces(blocks, n_each), reference))
-        errors = np.concatenate(found)
+        pairs = ((second, first.sum(0)), (first, second.sum(0)))
+        errors = np.concatenate([measure.squared(_pieces(blocks, n_each), reference) for blocks, reference in pairs])
         logs = np.log(errors[np.isfinite(errors) & (errors > 0)])
         if len(logs):
             lengths.append(length_ps * n_each / n_blocks)
@@ -149,16 +178,21 @@ def equivalent_time_by(measure: Measure, length_ps: float, seed: int = 0, n_draw
             # The two trajectories held whole against each other are one number, twice.
             counts.append(1 if n_each == n_blocks else len(logs))
         n_each *= 2
-    value = float(np.mean([measure.squared(own.sum(0)[None], reference)[0] for reference in references]))
+    value = float(measure.to_references(own.sum(0)[None])[0])
     if len(lengths) < 3 or not math.isfinite(value):
         return None
-    curve = _falling(np.asarray(means), np.asarray(counts, dtype=np.float64))
+    weights = np.asarray(counts, dtype=np.float64)
+    curve = np.asarray(isotonic_regression(np.asarray(means), weights=weights, increasing=False).x)
     log_lengths, log_error = np.log(lengths), math.log(max(value, 1e-300))
     at = _length_at(log_error, log_lengths, curve)
     # Where pieces are few their scatter is not known; it grows with length as rare events come in one by one.
     spread = np.maximum.accumulate(np.nan_to_num(scatter, nan=0.0))
     of_mean = float(np.interp(at, log_lengths, spread / np.sqrt(counts)))
-    own_error = max(_own_error(measure, references, seed, n_draws), float(np.interp(at, log_lengths, spread)))
+    draws = measure.own_draws(seed, n_draws)
+    draws = draws[np.isfinite(draws) & (draws > 0)]
+    few = len(draws) < 2 or len(own) < 2
+    bootstrapped = math.inf if few else float(np.log(draws).std()) * math.sqrt(len(own) / (len(own) - 1))
+    own_error = max(bootstrapped, float(np.interp(at, log_lengths, spread)))
     combined = math.hypot(own_error, of_mean)
     low, high = (_crossing(log_error + s * _NORMAL_95 * combined, log_lengths, curve) for s in (1, -1))
     bound: Literal["", "at least", "less than"] = ""
@@ -191,33 +225,10 @@ def _share_needed(measure: Measure, error: float) -> float:
     return float(shares[first]) if first < len(shares) else 1.0
 
 
-def _own_error(measure: Measure, references: tuple[FloatArray, FloatArray], seed: int, n_draws: int) -> float:
-    """Return the standard error of the logarithm of the candidate's squared distance (block bootstrap)."""
-    own, draws = measure.sums[1], _own_draws(measure, references, seed, n_draws)
-    draws = draws[np.isfinite(draws) & (draws > 0)]
-    if len(draws) < 2 or len(own) < 2:
-        return math.inf
-    return float(np.log(draws).std()) * math.sqrt(len(own) / (len(own) - 1))
-
-
-def _own_draws(measure: Measure, references: tuple[FloatArray, FloatArray], seed: int, n_draws: int) -> FloatArray:
-    """Return the candidate's squared distance in every draw of its blocks, `(n_draws,)`."""
-    own = measure.sums[1]
-    drawn = bootstrap_weights(len(own), n_draws, np.random.default_rng([seed, 7])) @ own
-    return np.asarray(np.mean([measure.squared(drawn, reference) for reference in references], axis=0))
-
-
 def _pieces(blocks: FloatArray, n_each: int) -> FloatArray:
     """Return the sums over every `n_each` blocks that follow each other, `(n_pieces, n_sums)`."""
     n_pieces = len(blocks) // n_each
     return np.asarray(blocks[: n_pieces * n_each].reshape(n_pieces, n_each, -1).sum(1))
-
-
-def _falling(values: FloatArray, weights: FloatArray) -> FloatArray:
-    """Return the non-increasing sequence nearest to `values` (isotonic regression)."""
-    from scipy.optimize import isotonic_regression
-
-    return np.asarray(isotonic_regression(values, weights=weights, increasing=False).x)
 
 
 def _length_at(log_error: float, log_lengths: FloatArray, curve: FloatArray) -> float:
@@ -269,26 +280,176 @@ def _cost_words(ratio: float) -> str:
 def equivalent_time_charts(found: Sequence[EquivalentTime]) -> list[LineChart]:
     """Return one chart a measure: the error of MD against its length, and the candidate's error as a level line."""
     charts = []
+    caption = (
+        "Distance to the reference of reference MD of each length (typical piece; band: 10 to 90 % of the pieces) and "
+        "of the candidate. Where the lines cross, MD is as good as the candidate."
+    )
     for w in found:
         unit, scale = ("ns", 1e-3) if w.lengths_ps[-1] >= 1e3 else ("ps", 1.0)
         x = np.asarray(w.lengths_ps) * scale
-        level = np.full(len(x), w.candidate_error)
+        of_md = (np.asarray(errors) for errors in (w.errors, w.errors_low, w.errors_high))
+        level = Line("candidate", "candidate", x, np.full(len(x), w.candidate_error))
+        title, x_label = f"Equivalent MD time by {w.measure}: {w.in_words()}", f"length of MD / {unit}"
+        lines = (Line("MD", "reference", x, *of_md), level)
         charts.append(
-            LineChart(
-                section="equivalent_time",
-                title=f"Equivalent MD time by {w.measure}: {w.in_words()}",
-                caption="Distance to the reference of reference MD of each length (typical piece; band: 10 to 90 % of "
-                "the pieces) and of the candidate. Where the lines cross, MD is as good as the candidate.",
-                x_label=f"length of MD / {unit}",
-                y_label="distance to the reference",
-                lines=(
-                    Line(
-                        "MD", "reference", x, np.asarray(w.errors), np.asarray(w.errors_low), np.asarray(w.errors_high)
-                    ),
-                    Line("candidate", "candidate", x, level),
-                ),
-                log_x=True,
-                log_y=True,
-            )
+            LineChart("equivalent_time", title, caption, x_label, "distance to the reference", lines, True, True)
         )
     return charts
+
+
+def equivalent_times(
+    reference: Features, candidate: Features, replicate: Features, torsions: Backbone, options: Options
+) -> tuple[EquivalentTime, ...]:
+    """Return the equivalent MD time by each measure that applies: histograms of the torsions and of TIC 0, bonds,
+    autocorrelation.
+
+    The candidate enters with all its frames; reference and replicate are cut to one length.
+    """
+    three = _equal_parts(reference, candidate, replicate)
+    if three is None:
+        return ()
+    length_ps = three[0][0].total_ps
+    found = [equivalent_time_by(m, length_ps, options.seed) for m in _measures(three, torsions, options)]
+    return tuple(w for w in found if w is not None)
+
+
+def joint_measure(
+    reference: Features, candidate: Features, replicate: Features, torsions: Backbone
+) -> tuple[Measure, float] | None:
+    """Return the φ/ψ map alone as a measure, and the length in ps of reference and replicate; None where there is no
+    residue with φ and ψ, or too few frames."""
+    three = _equal_parts(reference, candidate, replicate)
+    if three is None or not torsions.residues:
+        return None
+    return _joint_measure(three, torsions), three[0][0].total_ps
+
+
+def _equal_parts(reference: Features, candidate: Features, replicate: Features) -> Three | None:
+    """Cut reference and replicate to one length and divide all three into blocks; None where frames are too few."""
+    n = min(reference.n_frames, replicate.n_frames)
+    n_blocks = 1 << int(math.log2(max(min(SHORTEST_SHARE, n // _LEAST_FRAMES), 1)))
+    if n_blocks < 8:
+        return None
+    ref, other = reference.frames(0, n), replicate.frames(0, n)
+    own = make_blocks(candidate.segment_lengths, block_length(candidate.n_frames, longest_correlation(ref, other)))
+    even = [even_blocks(f.segment_lengths, n_blocks) for f in (ref, other)]
+    return [(ref, even[0]), (candidate, own), (other, even[1])]
+
+
+def even_blocks(segment_lengths: Sequence[int], n_blocks: int) -> Blocks:
+    """Return `n_blocks` blocks of equally many frames (but for one), counted through the segments in order."""
+    edges = np.linspace(0, sum(segment_lengths), n_blocks + 1).astype(int)
+    pieces, offset = [], 0
+    for segment, n in enumerate(segment_lengths):
+        for block in range(n_blocks):
+            start, stop = max(int(edges[block]) - offset, 0), min(int(edges[block + 1]) - offset, n)
+            if start < stop:
+                pieces.append(Piece(segment, start, stop, block))
+        offset += n
+    return Blocks(tuple(pieces), n_blocks, max(int(np.diff(edges).max()), 1))
+
+
+def _measures(three: Three, torsions: Backbone, options: Options) -> list[Measure]:
+    out = [_joint_measure(three, torsions)] if torsions.residues else []
+    name, columns = _torsion_columns(three[0][0], torsions)
+    if columns:
+        counts = [[_counts(_series(f, key), k, b) for f, b in three] for key, k in columns]
+        out.append(_histogram_measure("torsion_jsd", name, counts))
+        out += _tica_measures(three, options)
+        moving = _correlation_measure(three)
+        out += [moving] if moving is not None else []
+    elif n_bonds := three[0][0].bonds_nm[0].shape[1]:
+        bins = [distributions.normal_bins([x[:, k] for x in three[0][0].bonds_nm]) for k in range(n_bonds)]
+        counts = [[_counts(f.bonds_nm, k, b, bins[k]) for f, b in three] for k in range(n_bonds)]
+        out.append(_histogram_measure("bond_jsd", "bond lengths", counts))
+    return out
+
+
+def _torsion_columns(reference: Features, torsions: Backbone) -> tuple[str, list[tuple[str, int]]]:
+    """Return what the torsions are called together, and each as the series it is in and its column: phi and psi, or,
+    where there are none, rotatable torsions; rotors of what has nothing else that turns."""
+    backbone = [("phi", k) for k in range(len(torsions.phi))] + [("psi", k) for k in range(len(torsions.psi))]
+    if backbone:
+        return "single φ and ψ", evenly(backbone, MOST_HISTOGRAMS)
+    rotors = [k for k, t in enumerate(reference.probes.torsions) if t.kind == "rotor"] if reference.probes else []
+    for chosen, name in ((slow_torsions(reference), "single rotatable torsions"), (rotors, "single rotors")):
+        if chosen:
+            return name, evenly([("torsions", k) for k in chosen], MOST_HISTOGRAMS)
+    return "", []
+
+
+def _series(features: Features, key: str) -> Segments:
+    return features.series["torsions"] if key == "torsions" else getattr(features, key)
+
+
+def _counts(series: Segments, column: int, blocks: Blocks, bins: Bins = TORSION_BINS) -> FloatArray:
+    return distributions.block_counts([x[:, column] for x in series], bins, blocks)
+
+
+def _joint_measure(three: Three, torsions: Backbone) -> Measure:
+    per_residue = [[joint_counts(f, b, r) for f, b in three] for r in evenly(torsions.residues, MOST_MAPS)]
+    return _histogram_measure("joint_jsd", "φ/ψ map", per_residue)
+
+
+def _histogram_measure(key: str, name: str, counts: Sequence[Sequence[FloatArray]]) -> Measure:
+    """Return the measure whose square is the mean Jensen-Shannon divergence over several histograms.
+
+    `counts`: for each histogram those of (reference, candidate, replicate) per block.
+    """
+    visited = [sum(c.sum(0) for c in three) > 0 for three in counts]
+    kept = [[c[:, v] for c in three] for three, v in zip(counts, visited, strict=True)]
+    edges = np.cumsum([int(v.sum()) for v in visited])[:-1]
+    first, own, second = (np.concatenate([three[k] for three in kept], axis=1) for k in range(3))
+
+    def squared(p: FloatArray, q: FloatArray) -> FloatArray:
+        parts = zip(np.split(p, edges, axis=1), np.split(q, edges), strict=True)
+        return np.asarray(np.mean([distributions.divergence(a, b[None]) for a, b in parts], axis=0))
+
+    return Measure(key, "distribution", name, (first, own, second), squared)
+
+
+def _tica_measures(three: Three, options: Options) -> list[Measure]:
+    lag = max(1, round(options.tica_lag_ps / three[0][0].lag_ps))
+    features = [tica_features(f) for f, _ in three]
+    model = kinetics.fit_tica(features[0], lag) if max(map(len, features[0])) > 10 * lag else None
+    if model is None:
+        return []
+    projected = [[model.project(x) for x in segments] for segments in features]
+    bins = distributions.reference_bins(projected[0])
+    counts = [distributions.block_counts(x, bins, b) for x, (_, b) in zip(projected, three, strict=True)]
+    return [_histogram_measure("tic0_jsd", "TIC 0", [counts])]
+
+
+def _correlation_measure(three: Three) -> Measure | None:
+    """Return the root mean square difference of the autocorrelations of cos psi (of rotatable torsions where there is
+    no psi), at lags even on a log scale.
+
+    Lags run to the first zero crossing of the reference's slowest torsion. None where none moves.
+    """
+    moving = [turning(f) for f, _ in three]
+    chosen = evenly(range(len(moving[0])), MOST_MAPS)
+    series = [[m[k][2] for m in moving] for k in chosen]
+    longest = max((kinetics.zero_crossing(per_sample[0])[0] for per_sample in series), default=0)
+    longest = min(longest, *(max(f.segment_lengths) - 1 for f, _ in three))
+    if longest < 2:
+        return None
+    lags = np.unique(np.geomspace(1, longest, _LAGS).astype(int))
+    kept = np.concatenate([[0], lags])
+    sums = []
+    for k, (_, own) in enumerate(three):
+        parts = [kinetics.lag_sums(per_sample[k], own, int(lags[-1]) + 1) for per_sample in series]
+        sums.append(np.concatenate([a[:, kept] for s in parts for a in (s.xy, s.head, s.tail, s.n)], axis=1))
+
+    def curves(flat: FloatArray) -> FloatArray:
+        each = np.split(flat, 4 * len(series), axis=1)
+        found = [
+            kinetics.autocorrelation(kinetics.LagSums(*each[4 * k : 4 * k + 4]), np.eye(len(flat)))[:, 1:]
+            for k in range(len(series))
+        ]
+        return np.concatenate(found, axis=1)
+
+    def squared(p: FloatArray, q: FloatArray) -> FloatArray:
+        return np.asarray(((curves(p) - curves(q[None])) ** 2).mean(-1))
+
+    name = "autocorrelation of cos ψ" if moving[0][0][0] else "autocorrelation of rotatable torsions"
+    return Measure("psi_correlation", "kinetics", name, (sums[0], sums[1], sums[2]), squared)

@@ -17,7 +17,7 @@ from typing import Literal
 import numpy as np
 import numpy.typing as npt
 
-from surrogate.comparison.measure.msm import block_transitions
+from surrogate.comparison.measure.kinetics import block_transitions
 from surrogate.comparison.measure.statistics import Blocks, Piece
 from systems.errors import InputError
 

@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from surrogate.comparison.markov import Equilibrium, equilibrium
-from surrogate.comparison.measure import kinetics, msm
+from surrogate.comparison.measure import kinetics
 from surrogate.comparison.measure.distributions import is_alpha
 from surrogate.comparison.measure.slow_motion import SLOW_KINDS
 from surrogate.comparison.measure.structure import Backbone, backbone
@@ -30,7 +30,6 @@ IntArray = npt.NDArray[np.int64]
 
 _TICA_LAG_PS = 10.0
 _DIMENSIONS, _MICROSTATES, _FRAMES_A_MICROSTATE = 8, 100, 50
-_CLUSTERED_FRAMES = 10_000
 _MAP_BINS = 36
 # Shares are given no smaller error than counting leaves, and differ when they are so many errors apart.
 _APART, _LEAST_APART = 2.5, 0.02
@@ -285,27 +284,16 @@ def _tests(found: Equilibrium, ps: float) -> str:
 
 def _microstates(angles: list[FloatArray], lag_ps: float) -> list[IntArray]:
     """Return the microstate of every frame: k-means in the slow space of the torsions."""
-    from deeptime.clustering import KMeans
-
     features = [kinetics.circular_features(a) for a in angles]
     shortest = min(map(len, features))
     lag = max(1, min(round(_TICA_LAG_PS / lag_ps), shortest // 4))
-    projection = msm.fit_projection(features, lag, _DIMENSIONS, least=0.05)
+    projection = kinetics.fit_projection(features, lag, _DIMENSIONS, least=0.05)
     if projection is None:
         raise InputError("MD's replicas are too short to tell states apart; give them more time.")
     coordinates = [projection.project(x) for x in features]
     every = np.concatenate([x[np.isfinite(x).all(axis=1)] for x in coordinates])
     n = max(2, min(_MICROSTATES, len(every) // _FRAMES_A_MICROSTATE))
-    sample = every[:: max(1, len(every) // _CLUSTERED_FRAMES)]
-    model = KMeans(n, max_iter=100, tolerance=1e-3, fixed_seed=1, n_jobs=1).fit(sample).fetch_model()
-    out = []
-    for x in coordinates:
-        finite = np.isfinite(x).all(axis=1)
-        labels = np.full(len(x), -1, dtype=np.int64)
-        if finite.any():
-            labels[finite] = model.transform(np.ascontiguousarray(x[finite]), n_jobs=1)
-        out.append(labels)
-    return out
+    return kinetics.assign(kinetics.k_means(every, n, 100), coordinates)
 
 
 Named = tuple[str, list[IntArray], tuple[str, ...], list[IntArray] | None]
@@ -332,12 +320,12 @@ def _named_states(torsions: _Torsions, angles: list[FloatArray], own: list[Float
     first = torsions.n_phi + torsions.n_psi
     for k, torsion in enumerate(torsions.others):
         of_md, of_own = ([a[:, first + k] for a in segments or []] for segments in (angles, own))
-        wells = find_wells(torsion.label, of_md, of_own)
+        wells = find_wells(of_md, of_own)
         if len(wells.names) < 2:
             continue
         labels, rolled = wells.labels(of_md), None if own is None else wells.labels(of_own)
         values, state = np.concatenate([*of_md, *of_own]), np.concatenate([*labels, *(rolled or [])])
-        names = tuple(f"{math.degrees(msm.circular_mean(values[state == s]) / torsion.fold):.0f}°"
+        names = tuple(f"{math.degrees(kinetics.circular_mean(values[state == s]) / torsion.fold):.0f}°"
                       for s in range(len(wells.names)))  # fmt: skip
         found.append((torsion.label, labels, names, rolled))
     return found

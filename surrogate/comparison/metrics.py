@@ -6,24 +6,9 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Protocol
 
-from surrogate.comparison.input_notes import copy_rows
-from surrogate.comparison.rows.bond_rows import angle_rows, bond_rows, temperature_rows
+from surrogate.comparison.rows import kinetics_rows, published_metrics, structure_rows, torsion_rows, validity_rows
 from surrogate.comparison.rows.charts import Chart
-from surrogate.comparison.rows.forecast import forecast_charts
-from surrogate.comparison.rows.msm_rows import msm_rows
-from surrogate.comparison.rows.peptide_protocol import peptide_charts
-from surrogate.comparison.rows.relaxation_rows import boundary_row, correlation_rows, tica_rows
 from surrogate.comparison.rows.rows import ComparisonInput, Kind, Measured, Row, Skipped, TimeScale, by_group
-from surrogate.comparison.rows.shape_rows import (
-    along_time,
-    contact_rows,
-    hydrogen_bond_rows,
-    secondary_structure,
-    shape_rows,
-)
-from surrogate.comparison.rows.torsion_rows import intervention_rows, other_torsion_rows, population_rows, torsion_rows
-from surrogate.comparison.rows.validity_rows import energy_rows, validity_rows
-from surrogate.comparison.rows.within_rows import step_rows, within_rows
 
 
 class Metric(Protocol):
@@ -61,29 +46,33 @@ class FunctionMetric:
 
 
 METRICS: tuple[Metric, ...] = (
-    FunctionMetric("Validity of frames", "validity", "fast", validity_rows),
-    FunctionMetric("Copies of frames", "validity", "fast", copy_rows),
-    FunctionMetric("Bond lengths", "distribution", "fast", bond_rows),
-    FunctionMetric("Bond angles", "distribution", "fast", angle_rows),
-    FunctionMetric("Temperature of vibrations", "distribution", "fast", temperature_rows),
-    FunctionMetric("Potential energies", "distribution", "fast", energy_rows),
-    FunctionMetric("Populations of basins", "distribution", "slow", population_rows),
-    FunctionMetric("φ and ψ", "distribution", "slow", torsion_rows),
-    FunctionMetric("φ and ψ without frames that guards changed", "distribution", "slow", intervention_rows),
-    FunctionMetric("Other torsions", "distribution", "slow", other_torsion_rows),
-    FunctionMetric("Torsions within the states of slower ones", "distribution", "within states", within_rows),
-    FunctionMetric("Size and shape", "distribution", "slow", shape_rows),
-    FunctionMetric("Secondary structure", "distribution", "slow", secondary_structure),
-    FunctionMetric("Contacts", "distribution", "slow", contact_rows),
-    FunctionMetric("Hydrogen bonds", "distribution", "slow", hydrogen_bond_rows),
-    FunctionMetric("Relaxation of torsions", "kinetics", "slow", correlation_rows),
-    FunctionMetric("TIC 0", "kinetics", "slow", tica_rows),
-    FunctionMetric("Markov state model", "kinetics", "slow", msm_rows),
-    FunctionMetric("Steps from frame to frame", "kinetics", "step", step_rows),
-    FunctionMetric("Steps across chunk boundaries", "kinetics", "fast", boundary_row),
-    FunctionMetric("The peptide papers' recipe", "information", "slow", peptide_charts),
-    FunctionMetric("Forecast error", "information", "fast", forecast_charts),
-    FunctionMetric("RMSD and torsions along time", "information", "slow", along_time),
+    FunctionMetric("Validity of frames", "validity", "fast", validity_rows.validity_rows),
+    FunctionMetric("Copies of frames", "validity", "fast", validity_rows.copy_rows),
+    FunctionMetric("Bond lengths", "distribution", "fast", structure_rows.bond_rows),
+    FunctionMetric("Bond angles", "distribution", "fast", structure_rows.angle_rows),
+    FunctionMetric("Temperature of vibrations", "distribution", "fast", structure_rows.temperature_rows),
+    FunctionMetric("Potential energies", "distribution", "fast", validity_rows.energy_rows),
+    FunctionMetric("Populations of basins", "distribution", "slow", torsion_rows.population_rows),
+    FunctionMetric("φ and ψ", "distribution", "slow", torsion_rows.torsion_rows),
+    FunctionMetric(
+        "φ and ψ without frames that guards changed", "distribution", "slow", torsion_rows.intervention_rows
+    ),
+    FunctionMetric("Other torsions", "distribution", "slow", torsion_rows.other_torsion_rows),
+    FunctionMetric(
+        "Torsions within the states of slower ones", "distribution", "within states", torsion_rows.within_rows
+    ),
+    FunctionMetric("Size and shape", "distribution", "slow", structure_rows.shape_rows),
+    FunctionMetric("Secondary structure", "distribution", "slow", structure_rows.secondary_structure),
+    FunctionMetric("Contacts", "distribution", "slow", structure_rows.contact_rows),
+    FunctionMetric("Hydrogen bonds", "distribution", "slow", structure_rows.hydrogen_bond_rows),
+    FunctionMetric("Relaxation of torsions", "kinetics", "slow", kinetics_rows.correlation_rows),
+    FunctionMetric("TIC 0", "kinetics", "slow", kinetics_rows.tica_rows),
+    FunctionMetric("Markov state model", "kinetics", "slow", kinetics_rows.msm_rows),
+    FunctionMetric("Steps from frame to frame", "kinetics", "step", torsion_rows.step_rows),
+    FunctionMetric("Steps across chunk boundaries", "kinetics", "fast", kinetics_rows.boundary_row),
+    FunctionMetric("The peptide papers' recipe", "information", "slow", published_metrics.peptide_charts),
+    FunctionMetric("Forecast error", "information", "fast", published_metrics.forecast_charts),
+    FunctionMetric("RMSD and torsions along time", "information", "slow", structure_rows.along_time),
 )
 
 

@@ -8,16 +8,24 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import Literal, NamedTuple
 
-from surrogate.comparison.measure.statistics import holm
-from surrogate.comparison.rows.rows import UNLIKE_BELOW, Group, Options, Row, Word
+from surrogate.comparison.measure.slow_motion import rarely_crossed
+from surrogate.comparison.measure.statistics import effective_samples, holm
+from surrogate.comparison.rows.rows import UNLIKE_BELOW, ComparisonInput, Group, Options, Row, Word
+from surrogate.comparison.rows.validity_rows import copied_from
 from systems.chemistry import validity
+from systems.units import format_time_ps
 
 Status = Literal["indistinguishable", "close", "different", "broken", "undecided"]
 
 _FAILS_AT = 10.0
 _SHARE_SIGNIFICANCE = 0.01
 _SEVERITY: dict[Word, int] = {"fails": 3, "differs": 2, "close": 1, "agrees": 0, "undecided": 0}
-_MENTIONED = 3
+_MENTIONED, _MENTIONED_WHY = 3, 2
+LEAST_SAMPLES = 20
+# Fewer, and error bars of what follows the slow motion are themselves not known.
+LEAST_FOR_TESTS = 5
+# Samples that the reference itself holds, however short the candidate is.
+LEAST_FOR_EQUIVALENT_TIME = 10
 FINITE_KEY, STRAINED_KEY = f"valid:{validity.NOT_FINITE}", f"valid:{validity.BOND_20_PERCENT}"
 ALL_KEY = "valid:all"
 _WHAT: dict[Group, str] = {
@@ -27,7 +35,6 @@ _WHAT: dict[Group, str] = {
     "distributions": "distributions and free energies of torsions",
     "kinetics": "relaxation times and rates",
 }
-_MENTIONED_WHY = 2
 _GOOD, _BAD = ("agrees", "close"), ("differs", "fails")
 
 
@@ -43,6 +50,25 @@ class Cautions(NamedTuple):
 
 
 SURE = Cautions()
+
+
+def cautions_of(inputs: ComparisonInput, correlation: float, start: str = "") -> Cautions:
+    """Return which slow motions are not sampled, in words. `correlation`: the slowest of any trajectory, frames;
+    `start`: what of the reference still depends on where it started."""
+    short = lost = ""
+    samples = effective_samples(round(inputs.compared_ps / inputs.lag_ps), correlation)
+    if samples < LEAST_SAMPLES:
+        short = (
+            f"the slowest motion is remembered for {format_time_ps(correlation * inputs.lag_ps, 2)}, which "
+            f"makes {samples:.2g} independent samples, too few to compare with ({LEAST_SAMPLES} are needed)"
+        )
+    apart = rarely_crossed((inputs.reference.features, inputs.replicate.features), inputs.candidate.features)
+    if apart:
+        named = ", ".join(apart[:_MENTIONED]) + (f" and {len(apart) - _MENTIONED} more" if apart[_MENTIONED:] else "")
+        lost = (
+            f"it lies in another state of {named} than the reference, and hardly any run passes from one to the other"
+        )
+    return Cautions(short, lost, copied_from(inputs)[0], start)
 
 
 def evaluated_rows(rows: Sequence[Row], options: Options) -> tuple[Row, ...]:
@@ -167,10 +193,18 @@ def findings(rows: Sequence[Row]) -> tuple[str, ...]:
     return tuple(r.statement for r in bad)
 
 
-def replicate_differs(rows: Sequence[Row], options: Options) -> tuple[str, ...]:
-    """Return the metrics in which reference and replicate differ from each other (Holm over all rows)."""
+def unlike(rows: Sequence[Row], options: Options) -> list[str]:
+    """Return a warning where the replicate itself differs from the reference (Holm over all rows)."""
     corrected = holm([math.nan if r.form == "share" else r.p_replicate for r in rows])
-    return tuple(r.metric for r, p in zip(rows, corrected, strict=True) if p < options.significance)
+    off = [r.metric for r, p in zip(rows, corrected, strict=True) if p < options.significance]
+    return (
+        [
+            f"The replicate itself differs from the reference ({'; '.join(off)}): the two are not samples of one "
+            "simulation, or too short; trust no verdict on these metrics."
+        ]
+        if off
+        else []
+    )
 
 
 def _excess(row: Row) -> float:
@@ -220,11 +254,11 @@ def in_short(
     rows: Sequence[Row], status: Status, findings: Sequence[str], cautions: Cautions = SURE, equivalent_time: str = ""
 ) -> tuple[str, str, str]:
     """Return the three lines: whether to use the trajectory in place of reference MD, for what, and why."""
-    good, bad, unknown = _sorted(rows)
+    good, bad, unknown = map("; ".join, _sorted(rows))
     why = "; ".join(findings[:_MENTIONED_WHY])
-    for_what = f"Right: {_listed(good) or 'nothing that could be tested'}."
-    for_what += f" Wrong: {_listed(bad)}." if bad else ""
-    for_what += f" Not known: {_listed(unknown)}." if unknown else ""
+    for_what = f"Right: {good or 'nothing that could be tested'}."
+    for_what += f" Wrong: {bad}." if bad else ""
+    for_what += f" Not known: {unknown}." if unknown else ""
     ends = f" {equivalent_time}" if equivalent_time else ""
     if status == "broken":
         return "Do not use it.", "For nothing: frames are no molecules, or do not move as one.", f"Why: {why}."
@@ -241,19 +275,12 @@ def in_short(
 
 def _sorted(rows: Sequence[Row]) -> tuple[list[str], list[str], list[str]]:
     """Return what is right, what is wrong and what is not known, by the words of each group's rows."""
-    good, bad, unknown = [], [], []
+    good: list[str] = []
+    bad: list[str] = []
+    unknown: list[str] = []
     for group, name in _WHAT.items():
         words = [r.verdict for r in rows if r.group == group and r.key != ALL_KEY]
-        if not words:
-            continue
-        if any(w in _BAD for w in words):
-            bad.append(name)
-        elif 2 * sum(w in _GOOD for w in words) >= len(words):
-            good.append(name)
-        else:
-            unknown.append(name)
+        if words:
+            right = 2 * sum(w in _GOOD for w in words) >= len(words)
+            (bad if any(w in _BAD for w in words) else good if right else unknown).append(name)
     return good, bad, unknown
-
-
-def _listed(names: Sequence[str]) -> str:
-    return "; ".join(names)

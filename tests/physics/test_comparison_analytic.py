@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from known_answers import double_well_density, double_well_left_population
-from surrogate.comparison.measure import kinetics, msm
+from surrogate.comparison.measure import kinetics
 from surrogate.comparison.measure.statistics import Estimate, block_length, bootstrap_weights, estimate, make_blocks
 from systems.library.named_scenes import double_well
 
@@ -57,10 +57,10 @@ def measure(
     them."""
     blocks = make_blocks([len(labels)], each)
     weights = bootstrap_weights(blocks.n_blocks, N_DRAWS, rng)
-    occupied = msm.block_occupancy([labels], blocks, len(function))
+    occupied = kinetics.state_counts([labels], blocks, len(function))
     part, total = occupied[:, :-1][:, inside].sum(1), occupied.sum(1)
     population = estimate(part.sum() / total.sum(), weights @ part / (weights @ total), blocks.n_blocks)
-    sums = msm.function_sums(msm.block_transitions([labels], blocks, len(function), lag), function)
+    sums = kinetics.function_sums(kinetics.block_transitions([labels], blocks, len(function), lag), function)
     time = estimate(
         float(kinetics.timescale(kinetics.lagged_eigenvalue(sums), lag)),
         kinetics.timescale(kinetics.lagged_eigenvalue(sums, weights), lag),
@@ -81,7 +81,7 @@ def test_the_reference_lies_in_the_intervals_as_often_as_stated(system: str) -> 
     true_time, true_population = -1.0 / math.log(values[1]), float(exact[inside].sum())
     # The function is the exact one: in a comparison it comes from the reference, and serves every trajectory.
     flux = exact[:, None] * np.linalg.matrix_power(matrix, lag)
-    function = msm.slow_functions(flux, 1)[1][0]
+    function = kinetics.slow_functions(flux, 1)[1][0]
     rng = np.random.default_rng(1)
     each = block_length(N_FRAMES, true_time)
     found = [measure(run, inside, function, lag, each, rng) for run in walks(matrix, N_RUNS, N_FRAMES, 2)]
@@ -98,7 +98,7 @@ def test_intervals_from_frames_taken_for_independent_do_not_hold_the_reference()
     """Negative control: blocks of three frames where thirty remember each other."""
     matrix, x = double_well_chain(40)
     exact = stationary(matrix)
-    function = msm.slow_functions(exact[:, None] * matrix, 1)[1][0]
+    function = kinetics.slow_functions(exact[:, None] * matrix, 1)[1][0]
     rng = np.random.default_rng(3)
     reference = float(exact[x < 0].sum())
     found = [measure(run, x < 0, function, 1, 3, rng)[0] for run in walks(matrix, 60, 1_500, 4)]
@@ -118,7 +118,7 @@ def test_the_grid_has_the_wells_population() -> None:
 def test_chain_with_the_wrong_time_axis_is_outside() -> None:
     """Negative control: every second frame of the chain called a frame has half the timescale."""
     exact = stationary(CHAIN)
-    function = msm.slow_functions(exact[:, None] * np.linalg.matrix_power(CHAIN, 2), 1)[1][0]
+    function = kinetics.slow_functions(exact[:, None] * np.linalg.matrix_power(CHAIN, 2), 1)[1][0]
     reference = -1.0 / math.log(np.sort(np.linalg.eigvals(CHAIN).real)[::-1][1])
     rng = np.random.default_rng(5)
     runs = walks(CHAIN, 40, N_FRAMES, 6)[:, ::2]

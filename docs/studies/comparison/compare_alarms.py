@@ -152,7 +152,7 @@ def count_intervals(runs: Sequence[Ensemble], piece_ps: float) -> Intervals:
     from surrogate.comparison.measure.slow_motion import longest_correlation
     from surrogate.comparison.measure.statistics import block_length, effective_samples, make_blocks
     from surrogate.comparison.measure.structure import Baseline
-    from surrogate.comparison.rows.relaxation_rows import relaxation_of, turning
+    from surrogate.comparison.rows.kinetics_rows import relaxation_of, turning
     from surrogate.comparison.rows.rows import Options, make_sample
 
     baseline = Baseline.of(runs[0])

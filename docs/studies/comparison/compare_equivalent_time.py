@@ -48,8 +48,7 @@ def calibrate(
 
     Raises InputError for fewer than three runs, or runs without φ and ψ.
     """
-    from surrogate.comparison.equivalent_time import equivalent_time_by
-    from surrogate.comparison.equivalent_time_measures import joint_measure
+    from surrogate.comparison.equivalent_time import equivalent_time_by, joint_measure
     from surrogate.comparison.measure.structure import Baseline
 
     if len(runs) < _LEAST_RUNS:

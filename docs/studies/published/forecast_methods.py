@@ -34,7 +34,7 @@ N_GIVEN, N_NEW, N_SAMPLES = 10, 20, 5
 @dataclass(frozen=True)
 class Settings:
     """`budget_s` of wall time or `steps` for each method that is trained; `call_s`: end after so much wall time, saved.
-    `paper_size`: LaM-SLidE of the paper's sizes; `paper_form`: of its form, smaller. `solver_steps` of LaM-SLidE: a single one,
+    `paper_size`: LaM-SLidE of the paper's sizes; `paper_form`: of its form, smaller. `solver_steps` of LaM-SLidE: one,
     from noise straight to the predicted data, is the mean of what may come, nearer to what does come than a sample.
 
     Beyond the papers: `extrapolate`: LaM-SLidE learns what the polynomial extrapolation of the given frames

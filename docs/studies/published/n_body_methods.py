@@ -139,8 +139,8 @@ def lam_slide(train: ParticleSet, validation: ParticleSet, settings: Settings) -
 
 
 def set_forecaster(settings: Settings, n_particles: int) -> LamSlide:
-    """Return LaM-SLidE with a set of latents: joined in a token, for a CPU; of the paper's form, a token for each latent
-    of each frame and random identifiers, of half its width and latents; or of the published sizes (Table 10)."""
+    """Return LaM-SLidE with a set of latents: joined in a token, for a CPU; of the paper's form, a token for each
+    latent of each frame and random identifiers, of half its width and latents; or of the published sizes (Table 10)."""
     from surrogate.models.lam_slide.model import AutoencoderConfig
 
     code = AutoencoderConfig(identifier_pool=n_particles, latent_dim=32, n_octaves=3, type_weight=0.1)

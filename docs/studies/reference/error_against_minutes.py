@@ -34,11 +34,12 @@ import surrogate as sm
 from md_reference.run.machine import machine_name
 from md_reference.run.replicas import simulate_replicas
 from md_reference.simd.force_field import n_replicas
-from surrogate.comparison.convergence import angles_of, find_wells, tested_reference
+from surrogate.comparison.convergence import angles_of, tested_reference
 from surrogate.comparison.equivalent_time import EquivalentTime
 from surrogate.comparison.md_answer import MODEL_ERROR, Answer, md_answer
 from surrogate.comparison.measure.distributions import distance
 from surrogate.comparison.measure.structure import Baseline
+from surrogate.comparison.measure.torsions import find_wells
 from surrogate.comparison.read.ensemble import Ensemble, load_ensemble
 from surrogate.verbs.options import ReferenceOptions
 from surrogate.verbs.reference import resolve_run
@@ -228,7 +229,7 @@ def population_error(ref: Angles, other: Angles, weights: Sequence[FloatArray] |
     """Return the root mean square error of the populations of the states of every torsion, in per cent."""
     squares: list[float] = []
     for name, segments in ref.items():
-        wells = find_wells(name, segments)
+        wells = find_wells(segments)
         if len(wells.names) < 2:
             continue
         shares = []

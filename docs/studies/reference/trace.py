@@ -26,7 +26,7 @@ PACKAGES = tuple(str(ROOT / name) for name in ("systems", "md_reference", "surro
 VALUES = {
     "reference": ("Scene",),
     "train": ("TrainingFrames", "FrameSets", "MoleculeWindows"),
-    "compare": ("Ensemble", "StoredFrames", "Opened", "Probes"),
+    "compare": ("Ensemble", "StoredFrames", "Probes"),
 }
 
 

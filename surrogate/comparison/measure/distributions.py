@@ -1,4 +1,4 @@
-"""Histograms per block, Jensen-Shannon distance, basin populations and free energies."""
+"""Histograms per block, Jensen-Shannon distance, basins of the backbone."""
 
 from __future__ import annotations
 
@@ -7,21 +7,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
-from surrogate.comparison.measure.statistics import Blocks
+from surrogate.comparison.measure.statistics import AnyFloat, Blocks, BoolArray, FloatArray, IntArray
 from systems.units import GAS_CONSTANT_KJ_MOL_K
 
-FloatArray = npt.NDArray[np.float64]
-AnyFloat = npt.NDArray[np.floating]
-IntArray = npt.NDArray[np.int64]
-
-N_BINS_1D = 100
-N_BINS_2D = 50
-PI = math.pi
-
 # The cuts lie at the two minima of the psi density of ff99SB and ff14SB alanine dipeptide (about 80 and -120 degrees).
-ALPHA_PSI_RAD = (-2.0 * PI / 3.0, 80.0 * PI / 180.0)
+ALPHA_PSI_RAD = (-2.0 * math.pi / 3.0, 80.0 * math.pi / 180.0)
 
 
 @dataclass(frozen=True)
@@ -45,7 +36,7 @@ class Bins:
         """Bin edges, `(n + 1,)`."""
         return np.linspace(self.low, self.high, self.n + 1)
 
-    def index(self, values: AnyFloat) -> npt.NDArray[np.int64]:
+    def index(self, values: AnyFloat) -> IntArray:
         """Return the bin of each value, same shape as `values`."""
         width = (self.high - self.low) / self.n
         x = np.asarray(values, dtype=np.float64)
@@ -56,17 +47,21 @@ class Bins:
         return np.where(np.isfinite(x), out, self.n + 2)
 
 
-TORSION_BINS = Bins(-PI, PI, N_BINS_1D)
-RAMACHANDRAN_BINS = Bins(-PI, PI, N_BINS_2D)
+TORSION_BINS = Bins(-math.pi, math.pi, 100)
+RAMACHANDRAN_BINS = Bins(-math.pi, math.pi, 50)
 
 
-def reference_bins(segments: Sequence[AnyFloat], n: int = N_BINS_1D) -> Bins:
+def _finite_values(segments: Sequence[AnyFloat]) -> FloatArray:
+    values = np.concatenate([np.asarray(s, dtype=np.float64).ravel() for s in segments])
+    return values[np.isfinite(values)]
+
+
+def reference_bins(segments: Sequence[AnyFloat], n: int = 100) -> Bins:
     """Return bins over the finite values of the reference, from its least to its greatest and 5 % beyond.
 
     Without the margin the reference alone would have nothing outside its range, and any replicate would stand out.
     """
-    values = np.concatenate([np.asarray(s, dtype=np.float64).ravel() for s in segments])
-    values = values[np.isfinite(values)]
+    values = _finite_values(segments)
     if not len(values):
         return Bins(0.0, 1.0, n)
     low, high = float(values.min()), float(values.max())
@@ -74,42 +69,35 @@ def reference_bins(segments: Sequence[AnyFloat], n: int = N_BINS_1D) -> Bins:
     return Bins(low - margin, high + margin, n)
 
 
-def normal_bins(segments: Sequence[AnyFloat], n: int = N_BINS_1D) -> Bins:
+def normal_bins(segments: Sequence[AnyFloat], n: int = 100) -> Bins:
     """Return bins over four standard deviations on either side of the mean of the reference's finite values.
 
     For quantities that vibrate about one value: a few outliers in the reference do not widen the bins.
     """
-    values = np.concatenate([np.asarray(s, dtype=np.float64).ravel() for s in segments])
-    values = values[np.isfinite(values)]
+    values = _finite_values(segments)
     if not len(values):
         return Bins(0.0, 1.0, n)
     width = max(4.0 * float(values.std()), 1e-9)
     return Bins(float(values.mean()) - width, float(values.mean()) + width, n)
 
 
-def block_counts(segments: Sequence[AnyFloat], bins: Bins, blocks: Blocks) -> FloatArray:
-    """Return a histogram per block, `(n_blocks, bins.n_total)`, of `segments` of `(n_frames,)` values."""
-    counts = np.zeros((blocks.n_blocks, bins.n_total))
-    index = [bins.index(s) for s in segments]
+def count_in_blocks(index: Sequence[IntArray], n: int, blocks: Blocks) -> FloatArray:
+    """Return how often each of `n` bins occurs in each block, `(n_blocks, n)`, from indices `(n_frames,)`."""
+    counts = np.zeros((blocks.n_blocks, n))
     for piece in blocks.pieces:
-        part = index[piece.segment][piece.start : piece.stop]
-        counts[piece.block] += np.bincount(part, minlength=bins.n_total)
+        counts[piece.block] += np.bincount(index[piece.segment][piece.start : piece.stop], minlength=n)
     return counts
 
 
-def grouped_counts(segments: Sequence[AnyFloat], columns: IntArray, bins: Bins, blocks: Blocks) -> FloatArray:
-    """Return one histogram per block, `(n_blocks, bins.n_total)`, of `columns` of `(n_frames, k)` values together."""
-    return np.sum([block_counts([s[:, k] for s in segments], bins, blocks) for k in columns.tolist()], axis=0)
+def block_counts(segments: Sequence[AnyFloat], bins: Bins, blocks: Blocks) -> FloatArray:
+    """Return a histogram per block, `(n_blocks, bins.n_total)`, of `segments` of `(n_frames,)` values."""
+    return count_in_blocks([bins.index(s) for s in segments], bins.n_total, blocks)
 
 
 def block_counts_joint(x: Sequence[AnyFloat], y: Sequence[AnyFloat], bins: Bins, blocks: Blocks) -> FloatArray:
     """Return a joint histogram per block, `(n_blocks, bins.n_total ** 2)`, row-major with x first."""
     n = bins.n_total
-    counts = np.zeros((blocks.n_blocks, n * n))
-    index = [bins.index(a) * n + bins.index(b) for a, b in zip(x, y, strict=True)]
-    for piece in blocks.pieces:
-        counts[piece.block] += np.bincount(index[piece.segment][piece.start : piece.stop], minlength=n * n)
-    return counts
+    return count_in_blocks([bins.index(a) * n + bins.index(b) for a, b in zip(x, y, strict=True)], n * n, blocks)
 
 
 def divergence(counts_p: FloatArray, counts_q: FloatArray) -> FloatArray:
@@ -137,33 +125,30 @@ def distance(counts_p: FloatArray, counts_q: FloatArray) -> FloatArray:
     return np.asarray(np.sqrt(divergence(counts_p, counts_q)), dtype=np.float64)
 
 
-def is_alpha(psi_rad: AnyFloat) -> npt.NDArray[np.bool_]:
+def is_alpha(psi_rad: AnyFloat) -> BoolArray:
     """Return whether psi lies in the alpha basin, [-120, 80) degrees."""
     with np.errstate(invalid="ignore"):
         return (psi_rad >= ALPHA_PSI_RAD[0]) & (psi_rad < ALPHA_PSI_RAD[1])
 
 
-def is_beta(psi_rad: AnyFloat) -> npt.NDArray[np.bool_]:
+def is_beta(psi_rad: AnyFloat) -> BoolArray:
     """Return whether psi lies in the beta basin, the finite rest of the circle."""
     return np.isfinite(psi_rad) & ~is_alpha(psi_rad)
 
 
-def is_positive(phi_rad: AnyFloat) -> npt.NDArray[np.bool_]:
+def is_positive(phi_rad: AnyFloat) -> BoolArray:
     """Return whether phi > 0 (left-handed region)."""
     with np.errstate(invalid="ignore"):
         return np.asarray(phi_rad > 0)
 
 
-def block_occupancy(member: Sequence[npt.NDArray[np.bool_]], blocks: Blocks) -> tuple[FloatArray, FloatArray]:
+def block_occupancy(member: Sequence[BoolArray], blocks: Blocks) -> tuple[FloatArray, FloatArray]:
     """Return per block how many frames are in the basin and how many there are: two `(n_blocks,)` arrays.
 
     Frames that are not finite are members of nothing and stay in the denominator.
     """
-    inside, total = np.zeros(blocks.n_blocks), np.zeros(blocks.n_blocks)
-    for piece in blocks.pieces:
-        inside[piece.block] += np.count_nonzero(member[piece.segment][piece.start : piece.stop])
-        total[piece.block] += piece.stop - piece.start
-    return inside, total
+    counts = count_in_blocks([m.astype(np.int64) for m in member], 2, blocks)
+    return counts[:, 1], counts.sum(axis=1)
 
 
 def free_energy_kj(counts: FloatArray, temperature_k: float) -> FloatArray:

@@ -1,7 +1,8 @@
-"""Time correlation within segments: autocorrelation, its integral, TICA fitted on the reference.
+"""Estimators of how fast things move: autocorrelation and its integral, TICA, a Markov state model by deeptime.
 
-Nothing here pairs frames of two different segments. Frames that are not finite drop out of every pair they belong to
-(their number is evaluated elsewhere); the rest of the segment keeps its place in time.
+TICA and the Markov model (torsions -> TICA -> k-means -> transition counts -> PCCA) are fitted on the reference alone,
+and other trajectories are put into its coordinates and states. Nothing pairs frames of two different segments. Frames
+that are not finite drop out of every pair they belong to; the rest of the segment keeps its place in time.
 """
 
 from __future__ import annotations
@@ -14,14 +15,17 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from surrogate.comparison.measure.statistics import Blocks
-
-FloatArray = npt.NDArray[np.float64]
-AnyFloat = npt.NDArray[np.floating]
+from surrogate.comparison.measure.distributions import count_in_blocks
+from surrogate.comparison.measure.statistics import AnyFloat, Blocks, FloatArray, IntArray
 
 MAX_LAG_FRAMES = 50_000
-FRAMES_A_FEATURE = 2
+# Fewer frames for each feature, and TICA means nothing.
+_FRAMES_A_FEATURE = 2
 WITHOUT_TICA = "the torsions of the reference do not move, or its frames are too few for so many torsions"
+MAX_DIMENSIONS = 5
+_N_MICROSTATES = 50
+_MAX_STATES = 4
+_CLUSTERED_FRAMES = 10_000
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,7 +83,7 @@ def autocorrelation(sums: LagSums, weights: FloatArray | None = None) -> FloatAr
     return out[0] if weights is None else out
 
 
-def correlation_time(correlation: FloatArray) -> npt.NDArray[np.float64]:
+def correlation_time(correlation: FloatArray) -> FloatArray:
     """Return the integrated autocorrelation time in frames, trapezoid rule, up to the first zero crossing.
 
     `correlation` is `(..., n_lags)`. The last interval ends at the linearly interpolated zero. A curve that never
@@ -120,8 +124,7 @@ def zero_crossing(segments: Sequence[AnyFloat]) -> tuple[int, float]:
             return n_lags, math.nan
         below = ~(c > 0)
         if below.any() or n_lags >= ceiling:
-            first = int(below.argmax()) if below.any() else n_lags
-            return first, float(correlation_time(c))
+            return (int(below.argmax()) if below.any() else n_lags), float(correlation_time(c))
         n_lags = min(ceiling, n_lags * 8)
 
 
@@ -164,7 +167,7 @@ def lagged_eigenvalue(sums: PairSums, weights: FloatArray | None = None) -> Floa
     return np.asarray(out[0] if weights is None else out)
 
 
-def timescale(eigenvalue: npt.ArrayLike, lag: float) -> npt.NDArray[np.float64]:
+def timescale(eigenvalue: npt.ArrayLike, lag: float) -> FloatArray:
     """Return -lag / ln(eigenvalue), in the unit of `lag`; 0 for an eigenvalue of at most 0 (gone within one lag)."""
     value = np.asarray(eigenvalue, dtype=np.float64)
     with np.errstate(invalid="ignore", divide="ignore"):
@@ -176,26 +179,11 @@ def noise_timescale(n_parameters: int, lag: float, n_frames: float) -> float:
     """Return the timescale, in the unit of `lag`, that a process found among so many parameters has by chance.
 
     `lag` and `n_frames` in frames. The greatest eigenvalue of noise goes with the root of parameters over independent
-    pairs (Marchenko and Pastur); half of it is a choice, made on replicas of rigid molecules. Infinite:
-    nothing can be told.
+    pairs (Marchenko and Pastur); half of it is a choice, made on replicas of rigid molecules. Infinite: no process can
+    be told from noise.
     """
     eigenvalue = 0.5 * math.sqrt(n_parameters * lag / max(n_frames, 1.0))
     return math.inf if eigenvalue >= 1.0 else float(timescale(eigenvalue, lag))
-
-
-@dataclass(frozen=True, eq=False)
-class Tica:
-    """The slowest linear combination of features, fitted on the reference."""
-
-    mean: FloatArray
-    weights: FloatArray
-    lag_frames: int
-    eigenvalue: float
-
-    def project(self, features: AnyFloat) -> FloatArray:
-        """Return TIC 0, `(n_frames,)`, of `(n_frames, n_features)`; NaN where a feature is not finite."""
-        with np.errstate(invalid="ignore"):
-            return (np.asarray(features, dtype=np.float64) - self.mean) @ self.weights
 
 
 def circular_features(*torsions_rad: AnyFloat) -> FloatArray:
@@ -204,14 +192,50 @@ def circular_features(*torsions_rad: AnyFloat) -> FloatArray:
     return np.concatenate(parts, axis=1)
 
 
-def fit_tica(segments: Sequence[FloatArray], lag_frames: int) -> Tica | None:
-    """Fit TICA (reversible, mean removed; deeptime) to features `(n_frames, n_features)`; None when nothing varies, or
-    frames are so few that a slow combination would be found in any noise.
+def circular_mean(angles_rad: AnyFloat) -> float:
+    """Return the mean direction in radians; NaN for none."""
+    finite = angles_rad[np.isfinite(angles_rad)]
+    return math.nan if not len(finite) else float(np.arctan2(np.sin(finite).mean(), np.cos(finite).mean()))
 
-    Pairs never cross a segment, nor a frame that is not finite. The sign of TIC 0 is chosen so that its skewness is
-    positive: the rare state lies on the right. Source: Perez-Hernandez et al., J. Chem. Phys. 139, 015102 (2013).
+
+@dataclass(frozen=True, eq=False)
+class Projection:
+    """Slow coordinates of the reference: features `(n, k)` less `mean`, times `matrix` `(k,)` or `(k, n_dimensions)`;
+    `eigenvalues` `(n_dimensions,)` at the lag of the fit."""
+
+    mean: FloatArray
+    matrix: FloatArray
+    eigenvalues: FloatArray
+
+    def project(self, features: AnyFloat) -> FloatArray:
+        """Return coordinates `(n,)` or `(n, n_dimensions)`; NaN where a feature is not finite."""
+        with np.errstate(invalid="ignore"):
+            return np.asarray((np.asarray(features, dtype=np.float64) - self.mean) @ self.matrix)
+
+
+def _tica(segments: Sequence[FloatArray], lag_frames: int, dim: int) -> tuple[Any, list[FloatArray]] | None:
+    """Return deeptime's TICA (reversible, mean removed) of features `(n_frames, n_features)` and the runs of finite
+    frames it was fitted to; None where nothing varies, or frames are so few that any noise has a slow combination."""
+    from deeptime.decomposition import TICA
+
+    runs = [run for s in segments for run in finite_runs(s) if len(run) > lag_frames and run.shape[1]]
+    if not runs or max(float(run.std(0).max()) for run in runs) < 1e-9:
+        return None
+    if sum(map(len, runs)) < _FRAMES_A_FEATURE * runs[0].shape[1]:
+        return None
+    covariance = TICA.covariance_estimator(lagtime=lag_frames)
+    for run in runs:
+        covariance.partial_fit((run[:-lag_frames], run[lag_frames:]))
+    return TICA(lagtime=lag_frames, dim=dim).fit_from_covariances(covariance).fetch_model(), runs
+
+
+def fit_tica(segments: Sequence[FloatArray], lag_frames: int) -> Projection | None:
+    """Return TIC 0 of features `(n_frames, n_features)`, `matrix` `(n_features,)`; None as in `_tica`.
+
+    Its sign is chosen so that its skewness is positive: the rare state lies on the right. Source: Perez-Hernandez et
+    al., J. Chem. Phys. 139, 015102 (2013).
     """
-    fitted = tica_model(segments, lag_frames, 1)
+    fitted = _tica(segments, lag_frames, 1)
     if fitted is None:
         return None
     model, runs = fitted
@@ -220,29 +244,26 @@ def fit_tica(segments: Sequence[FloatArray], lag_frames: int) -> Tica | None:
     projected = np.concatenate([(run - mean) @ vector for run in runs])
     if float(((projected - projected.mean()) ** 3).sum()) < 0:
         vector = -vector
-    return Tica(mean, vector, lag_frames, float(np.real(model.singular_values[0])))
+    return Projection(mean, vector, np.real(np.asarray(model.singular_values))[:1])
 
 
-def tica_model(segments: Sequence[FloatArray], lag_frames: int, dim: int) -> tuple[Any, list[FloatArray]] | None:
-    """Return deeptime's model of features `(n_frames, n_features)` and the runs of finite frames it was fitted to; None
-    where `can_be_fitted` says so."""
-    from deeptime.decomposition import TICA
+def fit_projection(
+    segments: Sequence[FloatArray], lag_frames: int, dim: int = MAX_DIMENSIONS, *, least: float = 0.01
+) -> Projection | None:
+    """Return the slow coordinates of features `(n, k)`, scaled as a kinetic map; None as in `_tica`.
 
-    runs = [run for s in segments for run in finite_runs(s) if len(run) > lag_frames and run.shape[1]]
-    if not can_be_fitted(runs):
+    At most `dim` are kept, those whose eigenvalue exceeds `least` and in any case the first. Source: Noe and Clementi,
+    J. Chem. Theory Comput. 11, 5002 (2015): coordinates are scaled by their eigenvalues.
+    """
+    fitted = _tica(segments, lag_frames, dim)
+    if fitted is None:
         return None
-    covariance = TICA.covariance_estimator(lagtime=lag_frames)
-    for run in runs:
-        covariance.partial_fit((run[:-lag_frames], run[lag_frames:]))
-    return TICA(lagtime=lag_frames, dim=dim).fit_from_covariances(covariance).fetch_model(), runs
-
-
-def can_be_fitted(runs: Sequence[FloatArray]) -> bool:
-    """Return whether TICA of `runs` `(n_frames, n_features)` means anything: something varies, and there are at least
-    `FRAMES_A_FEATURE` frames for each feature."""
-    if not runs or max(float(run.std(0).max()) for run in runs) < 1e-9:
-        return False
-    return sum(map(len, runs)) >= FRAMES_A_FEATURE * runs[0].shape[1]
+    model, _ = fitted
+    values = np.real(np.asarray(model.singular_values))[:dim]
+    vectors = np.real(np.asarray(model.singular_vectors_left))[:, : len(values)]
+    kept = max(int((values > least).sum()), 1)
+    matrix = vectors[:, :kept] * np.clip(np.abs(values[:kept]), 1e-6, 1.0)
+    return Projection(np.asarray(model.mean_0, dtype=np.float64), matrix, values[:kept])
 
 
 def finite_runs(features: FloatArray) -> list[FloatArray]:
@@ -252,3 +273,149 @@ def finite_runs(features: FloatArray) -> list[FloatArray]:
         return [features]
     edges = np.flatnonzero(np.diff(np.concatenate([[0], finite.view(np.int8), [0]])))
     return [features[a:b] for a, b in zip(edges[::2], edges[1::2], strict=True)]
+
+
+def k_means(coordinates: FloatArray, n: int, max_iter: int) -> Any:
+    """Return deeptime's model of `n` clusters of finite coordinates `(n_frames, n_dimensions)`."""
+    from deeptime.clustering import KMeans
+
+    sample = coordinates[:: max(1, len(coordinates) // _CLUSTERED_FRAMES)]
+    return KMeans(n, max_iter=max_iter, tolerance=1e-3, fixed_seed=1, n_jobs=1).fit(sample).fetch_model()
+
+
+def assign(clusters: Any, coordinates: Sequence[FloatArray]) -> list[IntArray]:
+    """Return the nearest of deeptime's `clusters` of every frame, -1 where a coordinate is not finite."""
+    out = []
+    for x in coordinates:
+        finite = np.isfinite(x).all(axis=1)
+        labels = np.full(len(x), -1, dtype=np.int64)
+        if finite.any():
+            labels[finite] = clusters.transform(np.ascontiguousarray(x[finite]), n_jobs=1)
+        out.append(labels)
+    return out
+
+
+@dataclass(frozen=True, eq=False)
+class MarkovModel:
+    """Microstates and metastable states of the reference.
+
+    `centres` `(n_micro, n_dimensions)`; `state_of` `(n_micro,)` is the metastable state (0 the most populated) of each
+    microstate, -1 for those outside the connected set; `timescales` (frames) of the model.
+    """
+
+    centres: FloatArray
+    state_of: IntArray
+    n_states: int
+    lag_frames: int
+    timescales: FloatArray
+
+    def assign(self, coordinates: Sequence[FloatArray]) -> list[IntArray]:
+        """Return the microstate of every frame, -1 where a coordinate is not finite."""
+        from deeptime.clustering import ClusterModel
+
+        return assign(ClusterModel(self.centres), coordinates)
+
+    def lump(self, micro: Sequence[IntArray]) -> list[IntArray]:
+        """Return the metastable state of every frame, -1 where it has none."""
+        table = np.append(self.state_of, -1)
+        return [table[m] for m in micro]
+
+
+def fit_model(
+    coordinates: Sequence[FloatArray], lag_frames: int, n_micro: int = _N_MICROSTATES, n_states: int | None = None
+) -> MarkovModel | None:
+    """Cluster the projected reference, estimate its reversible MSM at `lag_frames` and lump it into metastable states.
+
+    `n_states`: how many; None for one more than there are processes slower than the lag, from 2 to 4. None is returned
+    when the connected set is too small for two states. Sources: k-means++ (Arthur and Vassilvitskii, 2007), PCCA+
+    (Roeblitz and Weber, Adv. Data Anal. Classif. 7, 147, 2013), both in deeptime.
+    """
+    from deeptime.markov import TransitionCountEstimator
+    from deeptime.markov.msm import MaximumLikelihoodMSM
+
+    every = np.concatenate([x[np.isfinite(x).all(axis=1)] for x in coordinates])
+    if len(every) < 20 * n_micro:
+        n_micro = max(len(every) // 20, 2)
+    clusters = k_means(every, n_micro, 200)
+    gaps = [np.where(m >= 0, m, np.nan)[:, None] for m in assign(clusters, coordinates)]
+    discrete = [run[:, 0].astype(np.int32) for m in gaps for run in finite_runs(m) if len(run) > lag_frames]
+    if not discrete:
+        return None
+    counts = TransitionCountEstimator(lagtime=lag_frames, count_mode="sliding").fit(discrete).fetch_model()
+    connected = counts.submodel_largest(connectivity_threshold=0)
+    if connected.n_states < 3:
+        return None
+    try:
+        markov = MaximumLikelihoodMSM(reversible=True).fit(connected).fetch_model()
+        times = np.asarray(markov.timescales())
+        # A process is slow, and separates states, when it outlives the lag.
+        slow = min(max(int((times > lag_frames).sum()) + 1, 2), _MAX_STATES)
+        wanted = min(slow if n_states is None else n_states, markov.n_states - 1)
+        lumped = markov.pcca(wanted)
+    except (RuntimeError, ValueError, np.linalg.LinAlgError):  # too few counts, or not so many sets that hold together
+        return None
+    populations = np.bincount(lumped.assignments, weights=markov.stationary_distribution, minlength=wanted)
+    rank = np.empty(wanted, dtype=np.int64)
+    rank[np.argsort(-populations)] = np.arange(wanted)
+    state_of = np.full(n_micro, -1, dtype=np.int64)
+    state_of[np.asarray(connected.state_symbols)] = rank[np.asarray(lumped.assignments)]
+    return MarkovModel(np.asarray(clusters.cluster_centers), state_of, wanted, lag_frames, times)
+
+
+def state_counts(labels: Sequence[IntArray], blocks: Blocks, n_states: int) -> FloatArray:
+    """Return how many frames of each block are in each state, `(n_blocks, n_states + 1)`; the last is "no state"."""
+    return count_in_blocks([np.where(x >= 0, x, n_states) for x in labels], n_states + 1, blocks)
+
+
+def block_transitions(labels: Sequence[IntArray], blocks: Blocks, n_states: int, lag: int) -> FloatArray:
+    """Return the transition counts of each block at `lag` frames, `(n_blocks, n_states ** 2)`, row-major (from, to).
+
+    A pair belongs to the block in which it starts; pairs with a frame that has no state do not count.
+    """
+    out = np.zeros((blocks.n_blocks, n_states * n_states))
+    for piece in blocks.pieces:
+        series = labels[piece.segment]
+        start = series[piece.start : min(piece.stop, max(len(series) - lag, 0))]
+        end = series[piece.start + lag : piece.start + lag + len(start)]
+        known = (start >= 0) & (end >= 0)
+        pair = start[known] * n_states + end[known]
+        out[piece.block] += np.bincount(pair, minlength=n_states * n_states)
+    return out
+
+
+def slow_functions(counts: FloatArray, n_slow: int) -> tuple[FloatArray, FloatArray]:
+    """Return the `n_slow` eigenvalues next to 1, descending, and eigenfunctions `(n_slow, n)` of counts `(n, n)`.
+
+    They are those of the transition matrix with every pair counted in both directions, which imposes detailed balance
+    and is exact for long equilibrium trajectories. States without counts have the value 0.
+    """
+    both = counts + counts.T
+    weight = both.sum(1)
+    scale = np.where(weight > 0, 1.0 / np.sqrt(np.maximum(weight, 1e-300)), 0.0)
+    values, vectors = np.linalg.eigh(scale[:, None] * both * scale[None, :])
+    order = np.argsort(-values)[1 : 1 + n_slow]
+    return values[order], (scale[:, None] * vectors[:, order]).T
+
+
+def function_sums(counts: FloatArray, function: FloatArray) -> PairSums:
+    """Return the pair sums of a function `(n,)` of the state, from transition counts per block `(n_blocks, n ** 2)`.
+
+    `lagged_eigenvalue` of them is the eigenvalue by which this function decays in that trajectory: of the counts it was
+    fitted to, the eigenvalue itself; of any other, that of the same process.
+    """
+    head, tail = np.repeat(function, len(function)), np.tile(function, len(function))
+    parts = (head * tail, head + tail, head**2 + tail**2, np.ones(len(head)))
+    return PairSums(*(counts @ part for part in parts))
+
+
+def chapman_kolmogorov(counts: Sequence[FloatArray]) -> tuple[FloatArray, FloatArray]:
+    """Return predicted and estimated probabilities to be in the state one started in, `(n_lags, n_states)` each.
+
+    `counts[i]`: transition counts `(n, n)` at `(i + 1)` times the lag; NaN for a state without any. The prediction is
+    the power of the first. Source: Prinz et al., J. Chem. Phys. 134, 174105 (2011), eq. 35.
+    """
+    with np.errstate(invalid="ignore", divide="ignore"):
+        matrices = [c / c.sum(-1, keepdims=True) for c in counts]
+    first = np.nan_to_num(matrices[0])
+    predicted = [np.diag(np.linalg.matrix_power(first, i + 1)) for i in range(len(counts))]
+    return np.array(predicted), np.array([np.diag(m) for m in matrices])

@@ -10,13 +10,12 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from surrogate.comparison.measure.statistics import FloatArray, IntArray
 from surrogate.comparison.measure.structure import Features
 from surrogate.comparison.read.ensemble import Ensemble
 from systems.chemistry import validity
 from systems.chemistry.geometry import superpose
-from systems.scene import Scene
 
-IntArray = npt.NDArray[np.int64]
 Frames = npt.NDArray[np.float32]
 Packed = npt.NDArray[np.int16]
 
@@ -38,12 +37,25 @@ class Clip:
     """
 
     name: str
-    time_ps: npt.NDArray[np.float64]
+    time_ps: FloatArray
     reference: Packed
     candidate: Packed
     reference_flags: npt.NDArray[np.uint16]
     candidate_flags: npt.NDArray[np.uint16]
     chunk_idx: npt.NDArray[np.int32] | None
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return what the viewer reads; coordinates as base64 of little-endian int16."""
+        packed = [x.astype("<i2").tobytes() for x in (self.reference, self.candidate)]
+        return {
+            "name": self.name,
+            "time": [float(f"{t:.8g}") for t in self.time_ps],
+            "reference": base64.b64encode(packed[0]).decode("ascii"),
+            "candidate": base64.b64encode(packed[1]).decode("ascii"),
+            "referenceFlags": self.reference_flags.tolist(),
+            "candidateFlags": self.candidate_flags.tolist(),
+            "chunk": None if self.chunk_idx is None else self.chunk_idx.tolist(),
+        }
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,13 +72,14 @@ class Movie:
     hydrogens_left_out: bool
 
     def to_dict(self) -> dict[str, Any]:
-        """Return what the viewer reads; coordinates as base64 of little-endian int16."""
+        """Return what the viewer reads."""
+        bits = [1 << k for k in range(16)]
         return {
             "elements": list(self.elements),
             "bonds": self.bonds.ravel().tolist(),
             "scale": self.scale_nm,
-            "faults": {str(bit): validity.flag_names(bit)[0] for bit in _bits()},
-            "clips": [_clip_dict(clip) for clip in self.clips],
+            "faults": {str(bit): name for bit in bits for name in validity.flag_names(bit)},
+            "clips": [clip.to_dict() for clip in self.clips],
         }
 
 
@@ -79,10 +92,9 @@ def make_movie(
     heavy), which is turned so that its longest axis lies across the picture. Hydrogens are left out above 300 atoms.
     """
     scene = reference.scene
-    shown = _shown_atoms(scene)
-    fitted = np.flatnonzero(np.array([e != "H" for e in scene.elements]))
-    if len(fitted) < 3:
-        fitted = np.arange(scene.n_atoms)
+    every, heavy = np.arange(scene.n_atoms), scene.heavy_idx
+    shown = every if scene.n_atoms <= HYDROGENS_UP_TO else heavy
+    fitted = heavy if len(heavy) >= 3 else every
     template = _flat_on(_first_finite(reference, candidate), fitted)
     scale = _ROOM * max(float(np.abs(template).max()), 0.1) / _LARGEST
     n_clip = int(min(MAX_FRAMES, max(2, MAX_NUMBERS // (3 * len(shown))), n_frames))
@@ -94,28 +106,15 @@ def make_movie(
     for name, idx in wanted:
         both = [_pack(pick_frames(e.segments, idx), template, fitted, shown, scale) for e in (reference, candidate)]
         chunks = candidate_features.chunk_idx
-        clips.append(
-            Clip(
-                name,
-                np.asarray((idx + 1) * reference.lag_ps, dtype=np.float64),
-                both[0],
-                both[1],
-                _pick(reference_features.flags, idx),
-                _pick(candidate_features.flags, idx),
-                None if chunks is None else _pick(chunks, idx),
-            )
-        )
-    bonds = np.asarray(scene.bonds, dtype=np.int64).reshape(-1, 2)
+        flags = [np.concatenate(list(f.flags))[idx] for f in (reference_features, candidate_features)]
+        chunk = None if chunks is None else np.concatenate(list(chunks))[idx]
+        time_ps = np.asarray((idx + 1) * reference.lag_ps, dtype=np.float64)
+        clips.append(Clip(name, time_ps, both[0], both[1], flags[0], flags[1], chunk))
     place = np.full(scene.n_atoms, -1)
     place[shown] = np.arange(len(shown))
-    kept = place[bonds]
-    return Movie(
-        tuple(scene.elements[a] for a in shown),
-        kept[(kept >= 0).all(axis=1)],
-        scale,
-        tuple(clips),
-        len(shown) < scene.n_atoms,
-    )
+    kept = place[np.asarray(scene.bonds, dtype=np.int64).reshape(-1, 2)]
+    bonds, elements = kept[(kept >= 0).all(axis=1)], tuple(scene.elements[a] for a in shown)
+    return Movie(elements, bonds, scale, tuple(clips), len(shown) < scene.n_atoms)
 
 
 def pick_frames(segments: Sequence[Any], idx: IntArray) -> Frames:
@@ -129,17 +128,6 @@ def pick_frames(segments: Sequence[Any], idx: IntArray) -> Frames:
     runs = zip(np.split(idx, breaks), np.split(of_segment, breaks), strict=True)
     parts = [segments[s[0]][run[0] - starts[s[0]] : run[-1] + 1 - starts[s[0]]] for run, s in runs]
     return np.asarray(np.concatenate(parts), dtype=np.float32)
-
-
-def _pick(series: Sequence[npt.NDArray[Any]], idx: IntArray) -> npt.NDArray[Any]:
-    return np.asarray(np.concatenate(list(series))[idx])
-
-
-def _shown_atoms(scene: Scene) -> IntArray:
-    everything = np.arange(scene.n_atoms)
-    if scene.n_atoms <= HYDROGENS_UP_TO:
-        return everything
-    return everything[[e != "H" for e in scene.elements]]
 
 
 def _first_finite(*ensembles: Ensemble) -> Frames:
@@ -168,23 +156,3 @@ def _pack(frames: Frames, template: Frames, fitted: IntArray, shown: IntArray, s
         laid = superpose(frames[usable], template, idx=fitted)[:, shown]
         packed[usable] = np.clip(np.rint(laid / scale_nm), -_LARGEST, _LARGEST).astype(np.int16)
     return packed
-
-
-def _bits() -> list[int]:
-    return [1 << k for k in range(16) if validity.flag_names(1 << k)]
-
-
-def _clip_dict(clip: Clip) -> dict[str, Any]:
-    return {
-        "name": clip.name,
-        "time": [float(f"{t:.8g}") for t in clip.time_ps],
-        "reference": _base64(clip.reference),
-        "candidate": _base64(clip.candidate),
-        "referenceFlags": clip.reference_flags.tolist(),
-        "candidateFlags": clip.candidate_flags.tolist(),
-        "chunk": None if clip.chunk_idx is None else clip.chunk_idx.tolist(),
-    }
-
-
-def _base64(values: Packed) -> str:
-    return base64.b64encode(values.astype("<i2").tobytes()).decode("ascii")

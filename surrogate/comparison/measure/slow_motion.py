@@ -10,11 +10,8 @@ import numpy as np
 import numpy.typing as npt
 
 from surrogate.comparison.measure import kinetics
-from surrogate.comparison.measure.probes import Family
-from surrogate.comparison.measure.structure import Features
-
-FloatArray = npt.NDArray[np.float64]
-Series = list[FloatArray]
+from surrogate.comparison.measure.statistics import BoolArray, FloatArray
+from surrogate.comparison.measure.structure import Family, Features
 
 # More series than this, and only those are followed whose means over blocks vary most.
 _MOST_FOLLOWED = 48
@@ -23,8 +20,9 @@ _SCREENING_BLOCKS = (8, 40)
 _FRAMES_A_FEATURE = 20
 _TICA_LAG_PS = 10.0
 _ANGLE_BINS = 36
-_TIMES_AS_OFTEN = 10.0
-_LEAST_APART = 0.3
+# States apart are angles that one side has so many times as often, with so large a share of its frames.
+_TIMES_AS_OFTEN, _LEAST_APART = 10.0, 0.3
+# Of fewer passages in all runs together nobody can tell which side is the likelier, however long each stays.
 _FEW_CROSSINGS = 5
 _STRETCHES = 200
 SLOW_KINDS = ("χ", "rotatable")
@@ -37,19 +35,15 @@ def longest_correlation(*features: Features) -> float:
     torsions (TICA). Trajectories that stay in different states share a mean that neither returns to: such a motion is
     as long as they are. 1 where nothing moves.
     """
-    chosen = _slowest(_all_series(features))
+    chosen = _slowest(list(_all_series(features)))
     slowest = tic_0(features)
     times = [kinetics.zero_crossing(s)[1] for s in (*chosen, *([] if slowest is None else [slowest]))]
     return max((t for t in times if math.isfinite(t)), default=1.0)
 
 
 def rarely_crossed(references: Sequence[Features], candidate: Features) -> list[str]:
-    """Return the torsions by which candidate and reference lie in different states that hardly any run passes between.
-
-    States apart are angles that one side has ten times as often as the other, with three frames in ten of the one. Of
-    fewer than `_FEW_CROSSINGS` passages in all runs together nobody can tell which side is the likelier, however long
-    each stays: replicas of one simulation do that, too.
-    """
+    """Return the torsions by which candidate and reference lie in different states that hardly any run passes between:
+    replicas of one simulation do that, too."""
     runs = [_angles(t) for t in (*references, candidate)]
     found = []
     for k, (label, own) in enumerate(runs[-1]):
@@ -71,12 +65,10 @@ def _angles(features: Features) -> list[tuple[str, list[npt.NDArray[Any]]]]:
     out = []
     for symbol, series in (("φ", features.phi), ("ψ", features.psi)):
         out += [(f"{symbol} {k + 1}", [x[:, k] for x in series]) for k in range(series[0].shape[1])]
-    if features.probes is not None:
-        families: tuple[tuple[Family, int, int], ...] = (("torsions", 0, 1), ("puckers", 1, 2))
-        for family, first, step in families:
-            if family in features.series:
-                names = features.probes.labels(family)[first::step]
-                out += [(n, [x[:, first + step * k] for x in features.series[family]]) for k, n in enumerate(names)]
+    families: tuple[tuple[Family, int, int], ...] = (("torsions", 0, 1), ("puckers", 1, 2))
+    for family, first, step in families if features.probes is not None else ():
+        names = features.probes.labels(family)[first::step] if features.probes else []
+        out += [(n, [x[:, first + step * k] for x in features.series[family]]) for k, n in enumerate(names)]
     return out
 
 
@@ -91,7 +83,7 @@ def _density(segments: Sequence[npt.NDArray[Any]]) -> FloatArray | None:
     return np.asarray(spread / spread.sum(), dtype=np.float64)
 
 
-def _passages(angles: npt.NDArray[Any], apart: npt.NDArray[np.bool_]) -> int:
+def _passages(angles: npt.NDArray[Any], apart: BoolArray) -> int:
     """Return how often one segment passes between the bins in `apart` and the others, at the resolution of stretches of
     a two-hundredth of its length; a stretch that has both counts as one."""
     values = np.asarray(angles, dtype=np.float64)
@@ -103,32 +95,31 @@ def _passages(angles: npt.NDArray[Any], apart: npt.NDArray[np.bool_]) -> int:
     return int(mixed.sum() + jumps.sum())
 
 
-def _all_series(features: Sequence[Features]) -> Iterator[Series]:
+def _all_series(features: Sequence[Features]) -> Iterator[list[FloatArray]]:
     """Yield every scalar that may move slowly, segments of all trajectories one after another."""
-    n_phi, n_psi = features[0].phi[0].shape[1], features[0].psi[0].shape[1]
-    further = features[0].series
-    n_torsions, n_puckers, n_shape = (
-        further[family][0].shape[1] if family in further else 0 for family in ("torsions", "puckers", "shape")
-    )
-    for k in range(n_phi):
-        yield [np.where(np.isfinite(x[:, k]), x[:, k] > 0, np.nan) for f in features for x in f.phi]
-    angles = [[x[:, k] for f in features for x in f.phi] for k in range(n_phi)]
-    angles += [[x[:, k] for f in features for x in f.psi] for k in range(n_psi)]
-    angles += [[x[:, k] for f in features for x in f.series["torsions"]] for k in range(n_torsions)]
+    first = features[0]
+
+    def columns(family: Any, start: int = 0, step: int = 1) -> list[list[npt.NDArray[Any]]]:
+        every = [x for f in features for x in (getattr(f, family) if family in ("phi", "psi") else f.series[family])]
+        return [[x[:, k] for x in every] for k in range(start, every[0].shape[1], step)]
+
+    phi = columns("phi")
+    for angle in phi:
+        yield [np.where(np.isfinite(x), x > 0, np.nan) for x in angle]
     # Of a ring: its amplitude, then its angle.
-    angles += [[x[:, k] for f in features for x in f.series["puckers"]] for k in range(1, n_puckers, 2)]
+    further = [*columns("torsions"), *columns("puckers", 1, 2)] if first.series else []
+    angles = [*phi, *columns("psi"), *further]
     for angle in angles:
         yield [np.cos(x.astype(np.float64)) for x in angle]
         yield [np.sin(x.astype(np.float64)) for x in angle]
-    for k in range(n_shape):
-        yield [x[:, k].astype(np.float64) for f in features for x in f.series["shape"]]
-    if not n_shape and not angles and features[0].bonds_nm[0].shape[1]:
+    if first.series:
+        yield from ([x.astype(np.float64) for x in column] for column in columns("shape"))
+    elif not angles and first.bonds_nm[0].shape[1]:
         yield [np.asarray(x.mean(1), dtype=np.float64) for f in features for x in f.bonds_nm]
 
 
-def _slowest(series: Iterator[Series]) -> list[Series]:
+def _slowest(every: list[list[FloatArray]]) -> list[list[FloatArray]]:
     """Return all series, or of many those whose means over long and over short blocks vary most for their width."""
-    every = list(series)
     if len(every) <= _MOST_FOLLOWED:
         return every
     chosen: set[int] = set()
@@ -138,7 +129,7 @@ def _slowest(series: Iterator[Series]) -> list[Series]:
     return [every[k] for k in sorted(chosen)]
 
 
-def _share_between(segments: Series, n_blocks: int) -> float:
+def _share_between(segments: list[FloatArray], n_blocks: int) -> float:
     """Return the variance of means over blocks over that of all frames."""
     values = np.concatenate(segments)
     values = np.where(np.isfinite(values), values, np.nanmean(values) if np.isfinite(values).any() else 0.0)
@@ -149,7 +140,7 @@ def _share_between(segments: Series, n_blocks: int) -> float:
     return float(values[: len(values) // size * size].reshape(-1, size).mean(axis=1).var()) / total
 
 
-def tic_0(features: Sequence[Features]) -> Series | None:
+def tic_0(features: Sequence[Features]) -> list[FloatArray] | None:
     """Return TIC 0 of all torsions, fitted on all trajectories together; None where frames are too few."""
     parts = [x for f in features for x in tica_features(f)]
     n_features = parts[0].shape[1]
@@ -161,15 +152,19 @@ def tic_0(features: Sequence[Features]) -> Series | None:
     return None if model is None else [model.project(x) for x in parts]
 
 
+def slow_torsions(features: Features) -> list[int]:
+    """Return the columns of the family "torsions" that are chi or another rotatable bond."""
+    return [k for k, t in enumerate(features.probes.torsions) if t.kind in SLOW_KINDS] if features.probes else []
+
+
 def tica_features(features: Features) -> list[FloatArray]:
     """Return cos and sin of phi, psi, chi and every other rotatable torsion, `(n_frames, k)` per segment.
 
     Amide bonds and rotors (methyl and the like) are left out: what turns them is not the slow motion looked for.
     """
-    slow = [k for k, t in enumerate(features.probes.torsions) if t.kind in SLOW_KINDS] if features.probes else []
-    further = features.series.get("torsions") if slow else None
+    slow = slow_torsions(features)
     out = []
     for i, (phi, psi) in enumerate(zip(features.phi, features.psi, strict=True)):
-        others = [] if further is None else [further[i][:, slow]]
+        others = [features.series["torsions"][i][:, slow]] if slow else []
         out.append(kinetics.circular_features(phi, psi, *others))
     return out

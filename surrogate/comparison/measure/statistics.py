@@ -17,6 +17,10 @@ import numpy.typing as npt
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
+BoolArray = npt.NDArray[np.bool_]
+AnyFloat = npt.NDArray[np.floating[Any]]
+# One array per stretch of unbroken time, frames first.
+Segments = Sequence[npt.NDArray[Any]]
 
 MIN_BLOCKS = 4
 MAX_BLOCKS = 100
@@ -52,11 +56,8 @@ class Blocks:
 
 @dataclass(frozen=True)
 class Estimate:
-    """A number with its 95 % interval.
-
-    `error` is the standard error; `log_error` that of the logarithm (NaN when the number is not positive);
-    `n_blocks` the number of blocks behind it, so `n_blocks - 1` degrees of freedom.
-    """
+    """A number with its 95 % interval, standard error, that of its logarithm (NaN when it is not positive), and the
+    number of blocks behind it."""
 
     value: float
     low: float = math.nan
@@ -71,11 +72,7 @@ class Estimate:
 
 
 def block_length(n_frames: int, correlation_frames: float) -> int:
-    """Return the block length in frames: ten correlation times, but at least 4 and at most 100 blocks in all.
-
-    Fewer than ten blocks are few degrees of freedom, and fewer than five no permutation test over many rows can find
-    significant: what has not been sampled is then undecided, never an alarm.
-    """
+    """Return the block length in frames: ten correlation times, but at least 4 and at most 100 blocks in all."""
     wanted = BLOCK_IN_CORRELATION_TIMES * correlation_frames if math.isfinite(correlation_frames) else n_frames
     shortest, longest = n_frames / MAX_BLOCKS, n_frames / MIN_BLOCKS
     return max(1, int(min(max(wanted, shortest), longest)))
@@ -110,12 +107,6 @@ def bootstrap_weights(n_blocks: int, n_draws: int, rng: np.random.Generator) -> 
     return rng.multinomial(n_blocks, np.full(n_blocks, 1.0 / n_blocks), size=n_draws).astype(np.float64)
 
 
-def _t_quantile(probability: float, n_blocks: int) -> float:
-    from scipy.special import stdtrit
-
-    return float(stdtrit(max(n_blocks - 1, 1), probability))
-
-
 def widening(n_blocks: int) -> float:
     """Return the factor from the spread of bootstrap draws to the standard error.
 
@@ -133,16 +124,15 @@ def estimate(value: float, draws: npt.ArrayLike, n_blocks: int, *, log: bool = F
     by Student's t over the normal quantile and by `widening`, because B blocks are few and remember each other. With
     `log` the interval is made for the logarithm, for quantities that are positive and skewed (times, ratios).
     """
+    from scipy.special import stdtrit
+
     array = np.asarray(draws, dtype=np.float64)
     array = array[np.isfinite(array)]
     if not math.isfinite(value) or len(array) < 2 or n_blocks < 2:
         return Estimate(value, n_blocks=n_blocks)
     widen = widening(n_blocks)
-    t_over_normal = _t_quantile(0.975, n_blocks) / 1.959964
-    log_error = math.nan
-    if value > 0:
-        positive = array[array > 0]
-        log_error = float(np.log(positive).std() * widen) if len(positive) == len(array) else math.nan
+    t_over_normal = float(stdtrit(n_blocks - 1, 0.975)) / 1.959964
+    log_error = float(np.log(array).std() * widen) if value > 0 and (array > 0).all() else math.nan
     error = float(array.std() * widen)
     if log and math.isfinite(log_error):
         logs = np.log(array)

@@ -6,19 +6,17 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
 import networkx as nx
 import numpy as np
-import numpy.typing as npt
 
+from surrogate.comparison.measure.statistics import FloatArray, IntArray, Segments
+from systems.chemistry.graph import atom_classes, backbone_torsions, bonded_graph, rotatable_torsions
 from systems.scene import Scene
 
 Kind = Literal["ω", "χ", "rotatable", "rotor"]
-
-FloatArray = npt.NDArray[np.float64]
-IntArray = npt.NDArray[np.int64]
-Segments = Sequence[npt.NDArray[Any]]
+Quad = tuple[int, int, int, int]
 
 _FLAT = 0.25
 _BINS = 72
@@ -36,11 +34,17 @@ class Torsion(NamedTuple):
     taken, so that it does not matter which of the hydrogens of a methyl group is called the first.
     """
 
-    quad: tuple[int, int, int, int]
+    quad: Quad
     label: str
     kind: Kind
     fold: int
-    equal: tuple[tuple[int, int, int, int], ...] = ()
+    equal: tuple[Quad, ...] = ()
+
+
+def residue_label(scene: Scene, atom: int) -> str:
+    """Return the name of an atom's residue, such as 'ALA 2'."""
+    residue = int(scene.residue_of_atom[atom])
+    return f"{scene.residue_names[residue]} {scene.residue_ids[residue]}"
 
 
 def find_torsions(scene: Scene) -> list[Torsion]:
@@ -50,19 +54,15 @@ def find_torsions(scene: Scene) -> list[Torsion]:
     further atoms are hydrogens (methyl, hydroxyl, ammonium). Chi is named and its atoms chosen by IUPAC-IUB 1970, rule
     4: from N through CA outwards, branch 1 before branch 2.
     """
-    from systems.chemistry.graph import atom_classes, backbone_torsions, bonded_graph, rotatable_torsions
-
     graph = bonded_graph(scene)
     backbone = backbone_torsions(scene)
     classes = atom_classes(scene).tolist()
     taken = {frozenset(q[1:3]) for name in ("phi", "psi", "omega") for q in backbone[name].tolist()}
     found = [Torsion((a, b, c, d), f"ω {_where(scene, b, c)}", "ω", 1) for a, b, c, d in backbone["omega"].tolist()]
     side = _side_chains(graph, backbone["phi"].tolist(), backbone["psi"].tolist())
-    for quad in rotatable_torsions(scene, rotors=True).tolist():
-        if frozenset(quad[1:3]) in taken:
-            continue
-        a, b, c, d = quad
-        found.append(_named(scene, graph, classes, side, (a, b, c, d)))
+    for a, b, c, d in rotatable_torsions(scene, rotors=True).tolist():
+        if frozenset((b, c)) not in taken:
+            found.append(_named(scene, graph, classes, side, (a, b, c, d)))
     return found
 
 
@@ -90,14 +90,12 @@ def _side_chains(graph: nx.Graph, phi: Sequence[Sequence[int]], psi: Sequence[Se
     return places
 
 
-def _named(
-    scene: Scene, graph: nx.Graph, classes: Sequence[int], side: dict[int, _Place], quad: tuple[int, int, int, int]
-) -> Torsion:
+def _named(scene: Scene, graph: nx.Graph, classes: Sequence[int], side: dict[int, _Place], quad: Quad) -> Torsion:
     a, b, c, d = quad
     turns = [_equal_positions(scene, graph, classes, *bond) for bond in ((b, c), (c, b))]
     fold = math.lcm(*turns)
 
-    def equal(a: int, b: int, c: int, d: int, turns: Sequence[int]) -> tuple[tuple[int, int, int, int], ...]:
+    def equal(a: int, b: int, c: int, d: int, turns: Sequence[int]) -> tuple[Quad, ...]:
         starts, ends = (
             [j for j in sorted(graph[i]) if j != other] if n > 1 else [alone]
             for i, other, alone, n in ((b, c, a, turns[0]), (c, b, d, turns[1]))
@@ -107,23 +105,20 @@ def _named(
     heavy = [[j for j in graph[i] if j != k and scene.elements[j] != "H"] for i, k in ((b, c), (c, b))]
     in_side = b in side and c in side and abs(side[b].depth - side[c].depth) == 1
     if not (heavy[0] and heavy[1]):
-        return Torsion((a, b, c, d), f"rotor {_bond(scene, b, c)}", "rotor", fold, equal(*quad, turns))
+        return Torsion((a, b, c, d), f"rotor {bond_label(scene, b, c)}", "rotor", fold, equal(*quad, turns))
     if not in_side:
-        return Torsion((a, b, c, d), f"torsion {_bond(scene, b, c)}", "rotatable", fold, equal(*quad, turns))
+        return Torsion((a, b, c, d), f"torsion {bond_label(scene, b, c)}", "rotatable", fold, equal(*quad, turns))
     near, far = (b, c) if side[b].depth < side[c].depth else (c, b)
-    outer = min(
-        (j for j in graph[far] if j != near and scene.elements[j] != "H"), key=lambda j: _branch(scene, classes, j)
-    )
-    residue = int(scene.residue_of_atom[near])
-    label = f"χ{side[near].depth + 1} {scene.residue_names[residue]} {scene.residue_ids[residue]}"
+
+    def branch(atom: int) -> tuple[int, int, int]:
+        # CG1 before CG2, by canonical rank where names carry no number.
+        digits = "".join(x for x in scene.atom_names[atom] if x.isdigit())
+        return int(digits or 0), -classes[atom], atom
+
+    outer = min((j for j in graph[far] if j != near and scene.elements[j] != "H"), key=branch)
+    label = f"χ{side[near].depth + 1} {residue_label(scene, near)}"
     chosen = (side[near].before, near, far, outer)
     return Torsion(chosen, label, "χ", fold, equal(*chosen, turns if near == b else turns[::-1]))
-
-
-def _branch(scene: Scene, classes: Sequence[int], atom: int) -> tuple[int, int, int]:
-    """Sorts branches: CG1 before CG2, by canonical rank where names carry no number."""
-    digits = "".join(x for x in scene.atom_names[atom] if x.isdigit())
-    return int(digits or 0), -classes[atom], atom
 
 
 def _equal_positions(scene: Scene, graph: nx.Graph, classes: Sequence[int], atom: int, other: int) -> int:
@@ -131,28 +126,19 @@ def _equal_positions(scene: Scene, graph: nx.Graph, classes: Sequence[int], atom
     far = [j for j in graph[atom] if j != other]
     if len({classes[j] for j in far}) != 1:
         return 1
-    if len(far) == 3:
-        return 3
-    if len(far) == 2 and _is_flat(scene, atom, [*far, other]):
-        return 2
-    return 1
-
-
-def _is_flat(scene: Scene, atom: int, near: Sequence[int]) -> bool:
-    a, b, c = (scene.positions_nm[j] - scene.positions_nm[atom] for j in near)
-    size = float(np.linalg.norm(a) * np.linalg.norm(b) * np.linalg.norm(c))
-    return abs(float(np.dot(np.cross(a, b), c))) < _FLAT * size
+    if len(far) == 2:
+        a, b, c = (scene.positions_nm[j] - scene.positions_nm[atom] for j in (*far, other))
+        size = float(np.linalg.norm(a) * np.linalg.norm(b) * np.linalg.norm(c))
+        return 2 if abs(float(np.dot(np.cross(a, b), c))) < _FLAT * size else 1
+    return 3 if len(far) == 3 else 1
 
 
 def _where(scene: Scene, i: int, j: int) -> str:
-    names = []
-    for atom in (i, j):
-        residue = int(scene.residue_of_atom[atom])
-        names.append(f"{scene.residue_names[residue]} {scene.residue_ids[residue]}")
-    return names[0] if names[0] == names[1] else f"{names[0]} - {names[1]}"
+    return " - ".join(dict.fromkeys(residue_label(scene, atom) for atom in (i, j)))
 
 
-def _bond(scene: Scene, i: int, j: int) -> str:
+def bond_label(scene: Scene, i: int, j: int) -> str:
+    """Return a bond's name for people: 'C-N (ACE 1 - ALA 2)' or 'CA-HA (ALA 2)'."""
     return f"{scene.atom_names[i]}-{scene.atom_names[j]} ({_where(scene, i, j)})"
 
 
@@ -160,7 +146,6 @@ def _bond(scene: Scene, i: int, j: int) -> str:
 class Wells:
     """States of one angle: `of_bin` `(72,)` holds the state of each bin of 5 degrees, -1 on a rim between two."""
 
-    torsion: str
     of_bin: IntArray
     names: tuple[str, ...]
 
@@ -184,7 +169,7 @@ class Wells:
         return [np.where(np.isfinite(x), s, -1) for x, s in zip(segments, self.assign(segments), strict=True)]
 
 
-def find_wells(torsion: str, *samples: Segments) -> Wells:
+def find_wells(*samples: Segments) -> Wells:
     """Return the states of an angle: peaks of its density, mean over the samples, that a deep enough minimum parts."""
     density = np.zeros(_BINS)
     for segments in filter(len, samples):
@@ -198,7 +183,7 @@ def find_wells(torsion: str, *samples: Segments) -> Wells:
     assert isinstance(smooth, np.ndarray)
     edges = _minima(smooth)
     if len(edges) < 2:
-        return Wells(torsion, np.zeros(_BINS, dtype=np.int64), ("",))
+        return Wells(np.zeros(_BINS, dtype=np.int64), ("",))
     of_bin = np.searchsorted(edges, np.arange(_BINS), side="right") - 1
     of_bin = np.where(of_bin < 0, len(edges) - 1, of_bin)
     degrees = [5 * e - 180 for e in edges]
@@ -210,7 +195,7 @@ def find_wells(torsion: str, *samples: Segments) -> Wells:
     for k in range(len(names)):
         if not (cores == k).any():
             cores[of_bin == k] = k
-    return Wells(torsion, cores, names)
+    return Wells(cores, names)
 
 
 def _minima(smooth: FloatArray) -> IntArray:

@@ -1,8 +1,5 @@
-"""An ensemble: all frames of one candidate, as segments of unbroken time, in the atom order of one scene.
-
-It is read from files that are opened, matched to the reference's atoms, made whole and laid out in time, and holds what
-they say of themselves: settings, costs, what guards did.
-"""
+"""An ensemble: all frames of one candidate, as segments of unbroken time, in the atom order of one scene; and how it is
+read from files, with what they say of themselves: settings, costs, what guards did."""
 
 from __future__ import annotations
 
@@ -14,17 +11,24 @@ from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from functools import reduce
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from surrogate.comparison.read.common_atoms import Match, match_scenes, solute_atoms
-from surrogate.comparison.read.stored_frames import StoredFrames, bond_tree, grid_of, rounded, rounding_note
+from surrogate.comparison.read.stored_frames import (
+    StoredFrames,
+    bond_tree,
+    grid_of,
+    match_scenes,
+    rounded,
+    rounding_note,
+    solute_atoms,
+)
 from systems.errors import InputError, OutOfDomainError, TrajectoryError, listed
 from systems.scene import Scene, part_of
 from systems.trajectory.base import TrajectoryReader
-from systems.trajectory.codec import DIFFERENCE_COLUMN, replicas_of, reweighting
+from systems.trajectory.codec import DIFFERENCE_COLUMN, open_trajectory, replicas_of, reweighting
 from systems.units import format_time_ps
 
 Frames = npt.NDArray[np.float32] | StoredFrames
@@ -41,7 +45,8 @@ _SAMPLED_VALUES = 20_000_000
 GUARD_COLUMN = "intervention"
 FloatArray = npt.NDArray[np.float64]
 
-_LEAST = 10
+# Fewer energies of a reference say nothing of how far its ensemble is the model's.
+_LEAST_ENERGIES = 10
 # Below this share of effective frames populations of the reference and of the model are two things.
 _FEW = 0.5
 _WIDEST_BOND_NM = 0.3
@@ -72,7 +77,6 @@ class InSegments(ABC):
 
     @property
     def n_frames(self) -> int:
-        """Frames of all segments together."""
         return sum(self.segment_lengths)
 
     @property
@@ -148,15 +152,11 @@ class Ensemble(InSegments):
         """Return every `stride`-th frame of each segment, with the lag that follows."""
         if stride == 1:
             return self
-        return replace(
-            self,
-            segments=[s.thinned(stride) if isinstance(s, StoredFrames) else s[::stride] for s in self.segments],
-            flags=None if self.flags is None else [f[::stride] for f in self.flags],
-            chunk_idx=None if self.chunk_idx is None else [c[::stride] for c in self.chunk_idx],
-            changed=None if self.changed is None else [c[::stride] for c in self.changed],
-            lag_ps=self.lag_ps * stride,
-            notes=(*self.notes, f"{self.label}: one frame in {stride} is used, for equal save intervals."),
-        )
+        segments = [s.thinned(stride) if isinstance(s, StoredFrames) else s[::stride] for s in self.segments]
+        columns = {"flags": self.flags, "chunk_idx": self.chunk_idx, "changed": self.changed}
+        thinned: dict[str, Any] = {k: [x[::stride] for x in series] for k, series in columns.items() if series}
+        note = f"{self.label}: one frame in {stride} is used, for equal save intervals."
+        return replace(self, segments=segments, lag_ps=self.lag_ps * stride, notes=(*self.notes, note), **thinned)
 
     def on_grid(self, grid_nm: float) -> Ensemble:
         """Return the same frames with coordinates rounded to `grid_nm`, where they are not as coarse already."""
@@ -200,26 +200,22 @@ def load_ensemble(
         raise InputError("No trajectory file was given.")
     name = label or Path(paths[0]).name + (f" + {len(paths) - 1} more" if len(paths) > 1 else "")
     segments: list[Frames] = []
-    flags: list[Flags] = []
-    chunks: list[npt.NDArray[np.int32]] = []
-    changed: list[npt.NDArray[np.bool_]] = []
+    columns: dict[str, list[Any]] = {"flags": [], "chunk_idx": [], "changed": []}
     records: list[dict[str, Any]] = []
-    scalars: list[Mapping[str, npt.NDArray[np.float64]]] = []
+    scalars: list[Mapping[str, FloatArray]] = []
     lags: list[float] = []
     notes: list[str] = []
     kept: list[IntArray] = []
     grids: list[float] = []
     stopped: list[str] = []
     for path in paths:
-        opened = open_matched(Path(path), template, None if top is None else Path(top), notes)
-        reader, template = opened.reader, opened.template
-        kept.append(opened.kept)
+        reader, frames, template, own = open_matched(Path(path), template, None if top is None else Path(top), notes)
+        kept.append(own)
         lag, cuts, note = time_axis(str(path), reader.time_ps if reader.times_known else None, reader.n_frames, lag_ps)
         replicas = replicas_of(reader.record, reader.n_frames)
         cuts = sorted({*cuts, *(part.start for part, _ in replicas[1:])})
         notes += note
         lags.append(lag)
-        frames = opened.frames
         grids += [grid_of(reader)] * (len(cuts) + 1)
         size = 12 * len(frames) * reader.n_atoms
         if size <= in_memory_bytes:
@@ -228,12 +224,14 @@ def load_ensemble(
             reader.close()
         else:
             segments += frames.split(cuts)
-        if reader.flags is not None:
-            flags += np.split(np.asarray(reader.flags, dtype=np.uint16), cuts)
-        if reader.chunk_idx is not None:
-            chunks += np.split(np.asarray(reader.chunk_idx, dtype=np.int32), cuts)
-        if GUARD_COLUMN in reader.scalars:
-            changed += np.split(reader.scalars[GUARD_COLUMN] > 0, cuts)
+        guarded = reader.scalars[GUARD_COLUMN] > 0 if GUARD_COLUMN in reader.scalars else None
+        of_file = {
+            "flags": None if reader.flags is None else np.asarray(reader.flags, dtype=np.uint16),
+            "chunk_idx": None if reader.chunk_idx is None else np.asarray(reader.chunk_idx, dtype=np.int32),
+            "changed": guarded,
+        }
+        for key, values in of_file.items():
+            columns[key] += [] if values is None else np.split(values, cuts)
         if len(replicas) > 1:
             notes.append(f"{path}: {len(replicas)} replicas in one file, which are compared as separate runs.")
         records += [record for _, record in replicas]
@@ -245,17 +243,17 @@ def load_ensemble(
         notes.append(f"{STOPPED}: {listed(stopped, 3)}.")
     if any(len(k) != len(kept[0]) or (k != kept[0]).any() for k in kept[1:]):
         raise InputError(f"{name}: its files hold different atoms of {template.name!r}; give them as candidates apart.")
-    notes += unseen_notes(name, records) + intervention_notes(name, records) + reweighting_notes(name, records, scalars)
+    if any(r.get("unseen_molecule") for r in records):
+        notes.append(f"{name}: its weights ({records[0].get('weights')}) were not trained on this molecule.")
+    notes += intervention_notes(name, records) + reweighting_notes(name, records, scalars)
     lag = common_lag([x for x in lags if math.isfinite(x)], paths, lag_ps)
     part = kept[0] if len(kept[0]) < template.n_atoms else None
+    known: dict[str, Any] = {key: v if len(v) == len(segments) else None for key, v in columns.items()}
     return Ensemble(
         label=name,
         segments=segments,
         lag_ps=lag,
         scene=template if part is None else part_of(template, part),
-        flags=flags if len(flags) == len(segments) else None,
-        chunk_idx=chunks if len(chunks) == len(segments) else None,
-        changed=changed if len(changed) == len(segments) else None,
         record=merged_record(records, name, notes),
         sources=tuple(str(p) for p in paths),
         top=None if top is None else str(top),
@@ -263,6 +261,7 @@ def load_ensemble(
         notes=tuple(notes),
         kept=part,
         grids_nm=tuple(grids),
+        **known,
     )
 
 
@@ -275,8 +274,13 @@ def alike(ensembles: Sequence[Ensemble]) -> tuple[list[Ensemble], IntArray | Non
     """
     reference, out = ensembles[0], list(ensembles)
     every = np.arange(reference.scene.n_atoms)
-    common = _common_atoms(every, [e.kept for e in out[1:]])
+    parts = [e.kept for e in out[1:] if e.kept is not None]
+    common = reduce(np.intersect1d, parts, every) if parts else None
     if common is not None:
+        if len(common) < 3:
+            raise InputError(
+                "The trajectories have fewer than three atoms in common; save more, or compare them apart."
+            )
         scene = part_of(reference.scene, common)
         held = [every if e is reference or e.kept is None else e.kept for e in out]
         out = [e.restricted(np.searchsorted(atoms, common), scene) for e, atoms in zip(out, held, strict=True)]
@@ -298,17 +302,6 @@ def alike(ensembles: Sequence[Ensemble]) -> tuple[list[Ensemble], IntArray | Non
     return out, common
 
 
-def _common_atoms(every: IntArray, kept: Sequence[IntArray | None]) -> IntArray | None:
-    """Return those of the atoms that all keep, None where nobody leaves any out."""
-    parts = [atoms for atoms in kept if atoms is not None]
-    if not parts:
-        return None
-    common = reduce(np.intersect1d, parts, every)
-    if len(common) < 3:
-        raise InputError("The trajectories have fewer than three atoms in common; save more, or compare them apart.")
-    return common
-
-
 def _common_strides(lags_ps: Sequence[float]) -> list[int]:
     """Return by how many of its frames each must step, so that all step by the same time."""
     lags = [Fraction(float(f"{lag:.6g}")).limit_denominator(1_000_000) for lag in lags_ps]
@@ -316,13 +309,6 @@ def _common_strides(lags_ps: Sequence[float]) -> list[int]:
     for lag in lags[1:]:
         common = Fraction(math.lcm(common.numerator, lag.numerator), math.gcd(common.denominator, lag.denominator))
     return [int(common / lag) for lag in lags]
-
-
-def unseen_notes(label: str, records: Sequence[dict[str, Any]]) -> list[str]:
-    """Return that a rollout's molecule was not trained on, else nothing."""
-    if not any(r.get("unseen_molecule") for r in records):
-        return []
-    return [f"{label}: its weights ({records[0].get('weights')}) were not trained on this molecule."]
 
 
 def intervention_notes(label: str, records: Sequence[dict[str, Any]]) -> list[str]:
@@ -355,7 +341,7 @@ def reweighting_notes(
     asked = np.concatenate(columns)
     asked = asked[~np.isnan(asked)]
     known = asked[np.isfinite(asked)]
-    if len(known) < _LEAST:
+    if len(known) < _LEAST_ENERGIES:
         return []
     _, effective = reweighting(known, float(temperature))
     ref = records[0].get("force_field", "its reference")
@@ -368,22 +354,14 @@ def reweighting_notes(
     ]
 
 
-class Opened(NamedTuple):
-    """An open file: its frames in the template's order, and which of the template's atoms they are."""
-
-    reader: TrajectoryReader
-    frames: StoredFrames
-    template: Scene
-    kept: IntArray
-
-
-def open_matched(path: Path, template: Scene | None, top: Path | None, notes: list[str]) -> Opened:
+def open_matched(
+    path: Path, template: Scene | None, top: Path | None, notes: list[str]
+) -> tuple[TrajectoryReader, StoredFrames, Scene, IntArray]:
     """Open a file and match its atoms to `template` (its own solute where None); what was done goes to `notes`.
 
-    Raises InputError, OutOfDomainError (another molecule), TrajectoryError.
+    Returns the reader, its frames in the template's order, the template, and which of its atoms they are. Raises
+    InputError, OutOfDomainError (another molecule), TrajectoryError.
     """
-    from systems.trajectory.codec import open_trajectory
-
     reader = open_trajectory(path, top=top)
     if reader.n_frames == 0:
         reader.close()
@@ -391,16 +369,13 @@ def open_matched(path: Path, template: Scene | None, top: Path | None, notes: li
     notes.extend(f"{path}: {note}" for note in reader.notes)
     scene = reader.scene
     order: IntArray | None = None
-    if scene is None and template is None:
-        raise InputError(f"{path} holds no topology; give one with `top='FILE.pdb'`.")
     if template is None:
-        assert scene is not None
-        order = solute_atoms(scene)
-        if len(order) < scene.n_atoms:
-            notes.append(f"{path}: water and single ions are left out ({scene.n_atoms - len(order)} atoms).")
-            template = part_of(scene, order)
-        else:
-            order, template = None, scene
+        if scene is None:
+            raise InputError(f"{path} holds no topology; give one with `top='FILE.pdb'`.")
+        template, atoms = scene, solute_atoms(scene)
+        if len(atoms) < scene.n_atoms:
+            notes.append(f"{path}: water and single ions are left out ({scene.n_atoms - len(atoms)} atoms).")
+            order, template = atoms, part_of(scene, atoms)
         kept = np.arange(template.n_atoms)
     elif scene is None:
         kept = np.arange(template.n_atoms)
@@ -418,21 +393,17 @@ def open_matched(path: Path, template: Scene | None, top: Path | None, notes: li
         order, kept = match.order, match.kept
         moved = len(order) < reader.n_atoms or bool((order != np.arange(len(order))).any())
         if match.how:
-            notes.append(_matched_note(path, match, template, moved))
+            how = "reordered" if moved else "in the same order"
+            if len(kept) < template.n_atoms:
+                how = f"{len(kept)} of {template.n_atoms} atoms"
+            notes.append(f"{path}: atoms matched by {match.how} ({how}).")
         order = order if moved else None
     tree = None
     cells = reader.read_cells(0, 1)
     if cells is not None and len(cells) and float(np.linalg.norm(cells[0], axis=1).min()) > 2 * _WIDEST_BOND_NM:
         tree = bond_tree(scene or template)
         notes.append(f"{path}: periodic; molecules are made whole.")
-    return Opened(reader, StoredFrames(reader, order=order, tree=tree), template, kept)
-
-
-def _matched_note(path: Path, match: Match, template: Scene, moved: bool) -> str:
-    how = "reordered" if moved else "in the same order"
-    if len(match.kept) < template.n_atoms:
-        how = f"{len(match.kept)} of {template.n_atoms} atoms"
-    return f"{path}: atoms matched by {match.how} ({how})."
+    return reader, StoredFrames(reader, order=order, tree=tree), template, kept
 
 
 def time_axis(

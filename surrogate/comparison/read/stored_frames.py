@@ -1,9 +1,9 @@
-"""Frames that stay in their file until they are asked for, whole molecules, in the atom order of the comparison; and
-what their coordinates are rounded to, as the file's header states or its numbers show.
+"""Frames of a file as those of the reference's molecule: atoms matched, molecules whole, coordinates rounded alike.
 
-A coordinate that is rounded to a grid of spacing g is off by a uniform error of standard deviation g/√12, and the
-length of a bond, along which two of them subtract, by g/√6. All trajectories of a comparison are laid on the coarsest
-grid of any of them, so that what rounding does to lengths, angles and nearest distances it does to all alike.
+A file may hold the whole molecule in any order, or a part of it. A coordinate that is rounded to a grid of spacing g is
+off by a uniform error of standard deviation g/√12, and the length of a bond, along which two of them subtract, by g/√6.
+All trajectories of a comparison are laid on the coarsest grid of any of them, so that what rounding does to lengths,
+angles and nearest distances it does to all alike.
 """
 
 from __future__ import annotations
@@ -11,13 +11,17 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
 
+import networkx as nx
 import numpy as np
 import numpy.typing as npt
 
-from systems.scene import Scene
+from systems.chemistry.graph import bonded_graph, match_atoms
+from systems.chemistry.residues import is_water_name
+from systems.errors import OutOfDomainError
+from systems.scene import Scene, part_of
 from systems.trajectory.base import TrajectoryReader
 
 Frames = npt.NDArray[np.float32]
@@ -30,8 +34,10 @@ _NEIGHBOURS = np.array(list(itertools.product((-1, 0, 1), repeat=3)), dtype=np.f
 _GRIDS_NM = (1e-2, 1e-3, 1e-4)
 # Fewer numbers lie on a grid by chance.
 _LEAST_NUMBERS = 24
-_OFF = 0.02
-_WORST_OFF = 0.2
+_OFF, _WORST_OFF = 0.02, 0.2
+_FLAT = 0.45
+_PSEUDO_BOND_NM = 0.11
+_BACKBONE = ("N", "CA", "C", "O")
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,13 +50,9 @@ class BondTree:
 
 def bond_tree(scene: Scene) -> BondTree:
     """Return the spanning forest of the scene's bonds, the largest molecule first."""
-    import networkx as nx
-
-    from systems.chemistry.graph import bonded_graph
-
     graph = bonded_graph(scene)
-    molecules = sorted((np.array(sorted(c), dtype=np.int64) for c in nx.connected_components(graph)),
-                       key=lambda atoms: (-len(atoms), int(atoms[0])))  # fmt: skip
+    components = [np.array(sorted(c), dtype=np.int64) for c in nx.connected_components(graph)]
+    molecules = sorted(components, key=lambda atoms: (-len(atoms), int(atoms[0])))
     levels: list[tuple[list[int], list[int]]] = []
     for atoms in molecules:
         depth = {int(atoms[0]): 0}
@@ -60,9 +62,7 @@ def bond_tree(scene: Scene) -> BondTree:
                 levels.append(([], []))
             levels[depth[child] - 1][0].append(parent)
             levels[depth[child] - 1][1].append(child)
-    return BondTree(
-        tuple((np.array(a, dtype=np.int64), np.array(b, dtype=np.int64)) for a, b in levels), tuple(molecules)
-    )
+    return BondTree(tuple((np.array(a), np.array(b)) for a, b in levels), tuple(molecules))
 
 
 def make_whole(frames_nm: Frames, cells_nm: npt.NDArray[np.floating], tree: BondTree) -> Frames:
@@ -139,24 +139,25 @@ class StoredFrames:
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> npt.NDArray[Any]:
         return self[:].astype(dtype or np.float32, copy=False)
 
+    def _with(self, span: range, order: IntArray | None = None, grid_nm: float | None = None) -> StoredFrames:
+        grid = self._grid_nm if grid_nm is None else grid_nm
+        return StoredFrames(self._reader, span, self._order if order is None else order, self._tree, grid)
+
     def thinned(self, stride: int) -> StoredFrames:
         """Return every `stride`-th frame, unread."""
-        return StoredFrames(self._reader, self._span[::stride], self._order, self._tree, self._grid_nm)
+        return self._with(self._span[::stride])
 
     def restricted(self, atoms: IntArray) -> StoredFrames:
         """Return some of the atoms `(k,)` of every frame, unread."""
-        order = atoms if self._order is None else self._order[atoms]
-        return StoredFrames(self._reader, self._span, order, self._tree, self._grid_nm)
+        return self._with(self._span, atoms if self._order is None else self._order[atoms])
 
     def on_grid(self, grid_nm: float) -> StoredFrames:
         """Return the same frames rounded to `grid_nm`, unread."""
-        return StoredFrames(self._reader, self._span, self._order, self._tree, grid_nm)
+        return self._with(self._span, grid_nm=grid_nm)
 
     def split(self, cuts: Sequence[int]) -> list[StoredFrames]:
         """Return the stretches that begin at frame 0 and at each of `cuts`, unread."""
-        edges = [0, *cuts, len(self)]
-        return [StoredFrames(self._reader, self._span[a:b], self._order, self._tree, self._grid_nm)
-                for a, b in itertools.pairwise(edges)]  # fmt: skip
+        return [self._with(self._span[a:b]) for a, b in itertools.pairwise([0, *cuts, len(self)])]
 
 
 def grid_of(reader: TrajectoryReader) -> float:
@@ -206,4 +207,148 @@ def rounding_note(labels: list[str], grid_nm: float) -> str:
     return (
         f"{' and '.join(labels)}: coordinates are rounded to {10.0 * grid_nm:.3g} Å, which alone makes bond lengths "
         f"vary by {error:.2g} Å; all trajectories are compared rounded alike, and what is narrower is hidden."
+    )
+
+
+class Match(NamedTuple):
+    """Atom `order[k]` of the file is atom `kept[k]` of the template; `how` says by what they were matched."""
+
+    order: IntArray
+    kept: IntArray
+    how: str
+
+
+def solute_atoms(scene: Scene) -> IntArray:
+    """Return the atoms that are evaluated: all but water and single ions, where anything else is left."""
+    kept: list[int] = []
+    largest = 0
+    for component in nx.connected_components(bonded_graph(scene)):
+        atoms = sorted(component)
+        elements = sorted(scene.elements[i] for i in atoms)
+        named_water = is_water_name(scene.residue_names[int(scene.residue_of_atom[atoms[0]])])
+        if len(atoms) > 1 and elements != ["H", "H", "O"] and not (named_water and set(elements) <= {"H", "O"}):
+            kept += atoms
+            largest = max(largest, sum(e != "H" for e in elements))
+    # A trace of single atoms without bonds is a molecule all the same.
+    return np.array(sorted(kept), dtype=np.int64) if largest > 1 else np.arange(scene.n_atoms)
+
+
+def match_scenes(scene: Scene, template: Scene) -> Match:
+    """Match a file's `scene` to the `template`: by the bonded graph when both hold one molecule, else what both have.
+
+    Atoms that only one of them holds (water, hydrogens, side chains that were not saved) are left out: first by names
+    and residues, then heavy atoms by the bonded graph with handedness, then the backbone, then alpha carbons in order.
+    Raises OutOfDomainError when they are different molecules.
+    """
+    everything = np.arange(template.n_atoms)
+    if scene.topology_hash == template.topology_hash:
+        return Match(everything, everything, "")
+    own = solute_atoms(scene)
+    solute = scene if len(own) == scene.n_atoms else part_of(scene, own)
+    try:
+        return Match(own[match_atoms(solute, template)], everything, "the bond graph")
+    except OutOfDomainError as error:
+        if sorted(solute.elements) == sorted(template.elements):
+            raise
+        heavy = solute.heavy_idx, template.heavy_idx
+        found = (
+            _by_names(solute, template)
+            or _by_graph(solute, heavy[0], template, heavy[1], "the bond graph of the heavy atoms")
+            or _by_backbone(solute, template)
+        )
+        if found is None:
+            raise OutOfDomainError(f"{error} Nor is one of them a part of the other.") from error
+    rank = np.argsort(found.kept)
+    return Match(own[found.order[rank]], found.kept[rank], found.how)
+
+
+def _by_names(scene: Scene, template: Scene) -> Match | None:
+    """Atoms of equal name in residues of equal name and number; None unless one side's heavy atoms are all found.
+
+    The bonds among the atoms found must be the same, so that equal names in different molecules do not match.
+    """
+    ours, theirs = _named(scene), _named(template)
+    if ours is None or theirs is None:
+        return None
+    both = [(ours[key], theirs[key]) for key in ours if key in theirs]
+    if any(scene.elements[i] != template.elements[k] for i, k in both):
+        return None
+    order, kept = (np.array([pair[side] for pair in both], dtype=np.int64) for side in (0, 1))
+    n_heavy = sum(scene.elements[i] != "H" for i in order.tolist())
+    if n_heavy < 3 or n_heavy < min(len(scene.heavy_idx), len(template.heavy_idx)):
+        return None
+    if _bonds_among(scene, order) != _bonds_among(template, kept):
+        return None
+    return Match(order, kept, "names and residues")
+
+
+def _named(scene: Scene) -> dict[tuple[str, str, str], int] | None:
+    atoms = zip(scene.residue_of_atom.tolist(), scene.atom_names, strict=True)
+    keys = [(scene.residue_ids[r], scene.residue_names[r], name) for r, name in atoms]
+    return {key: i for i, key in enumerate(keys)} if len(set(keys)) == len(keys) else None
+
+
+def _bonds_among(scene: Scene, atoms: IntArray) -> set[tuple[int, int]]:
+    place = {int(atom): k for k, atom in enumerate(atoms)}
+    inside = [(place[i], place[j]) for i, j in scene.bonds.tolist() if i in place and j in place]
+    return {(min(bond), max(bond)) for bond in inside}
+
+
+def _by_backbone(scene: Scene, template: Scene) -> Match | None:
+    """N, CA, C, O of every residue, or CA alone, by graph and then by the order and names of residues."""
+    for names in (_BACKBONE, _BACKBONE[:3]):
+        ours, theirs = _called(scene, names), _called(template, names)
+        if len(ours) == scene.n_atoms or len(theirs) == template.n_atoms:
+            found = _by_graph(scene, ours, template, theirs, "the bond graph of the backbone")
+            if found is not None:
+                return found
+    ours, theirs = _called(scene, ("CA",)), _called(template, ("CA",))
+    if (len(ours) == scene.n_atoms or len(theirs) == template.n_atoms) and len(ours) == len(theirs) > 2:
+        sides = ((scene, ours), (template, theirs))
+        named = [[s.residue_names[int(s.residue_of_atom[i])] for i in atoms] for s, atoms in sides]
+        if named[0] == named[1]:
+            return Match(ours, theirs, "the sequence of alpha carbons")
+    return None
+
+
+def _called(scene: Scene, names: tuple[str, ...]) -> IntArray:
+    return np.array([i for i, name in enumerate(scene.atom_names) if name in names], dtype=np.int64)
+
+
+def _by_graph(scene: Scene, ours: IntArray, template: Scene, theirs: IntArray, how: str) -> Match | None:
+    if len(ours) != len(theirs) or len(ours) < 3:
+        return None
+    parts = [_with_pseudo_hydrogens(part_of(s, atoms)) for s, atoms in ((scene, ours), (template, theirs))]
+    try:
+        order = match_atoms(*parts)[: len(theirs)]
+    except OutOfDomainError:
+        return None
+    return Match(ours[order], theirs, how)
+
+
+def _with_pseudo_hydrogens(scene: Scene) -> Scene:
+    """Add a hydrogen to every atom with three neighbours that is not flat, so that its handedness can be compared."""
+    x = scene.positions_nm
+    centres, places = [], []
+    for i, around in enumerate(scene.neighbours()):
+        if len(around) != 3:
+            continue
+        arms = x[around] - x[i]
+        arms /= np.maximum(np.linalg.norm(arms, axis=1, keepdims=True), 1e-9)
+        if abs(float(np.linalg.det(arms))) > _FLAT:
+            away = -arms.sum(axis=0)
+            centres.append(i)
+            places.append(x[i] + _PSEUDO_BOND_NM * away / np.linalg.norm(away))
+    n, k = scene.n_atoms, len(centres)
+    added = np.array([[i, n + m] for m, i in enumerate(centres)], dtype=np.int64).reshape(-1, 2)
+    return replace(
+        scene,
+        atom_names=(*scene.atom_names, *("H",) * k),
+        elements=(*scene.elements, *("H",) * k),
+        residue_of_atom=np.concatenate([scene.residue_of_atom, scene.residue_of_atom[centres]]),
+        bonds=np.concatenate([scene.bonds.reshape(-1, 2), added]),
+        bond_orders=np.concatenate([np.zeros(len(scene.bonds)), np.zeros(k)]),
+        formal_charges=np.zeros(n + k, dtype=np.int64),
+        masses_da=np.concatenate([scene.masses_da, np.ones(k)]),
+        positions_nm=np.concatenate([x, np.array(places).reshape(-1, 3)]),
     )

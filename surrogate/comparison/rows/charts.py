@@ -1,7 +1,5 @@
-"""Charts as plain numbers: what any room of metrics hands to the report, which draws each by its type.
-
-A room computes, the report draws: nothing here knows colours or pixels, and all of it goes into the JSON as it is.
-"""
+"""Charts as plain numbers, which the report draws each by its type: nothing here knows colours or pixels, and all of it
+goes into the JSON as it is."""
 
 from __future__ import annotations
 
@@ -11,11 +9,8 @@ from dataclasses import dataclass, is_dataclass
 from typing import Any, Literal
 
 import numpy as np
-import numpy.typing as npt
 
-from surrogate.comparison.measure.statistics import Estimate
-
-FloatArray = npt.NDArray[np.float64]
+from surrogate.comparison.measure.statistics import Estimate, FloatArray
 
 Section = Literal["structure", "distributions", "kinetics", "forecast", "validity", "equivalent_time"]
 Role = Literal["reference", "candidate", "replicate", "other"]
@@ -141,20 +136,9 @@ def bar_chart(
         found = np.array([getattr(e, name) for e in made[which]], dtype=np.float64)
         return np.clip(found, 0.0, 100.0) if y_label.endswith("/ %") else found
 
-    return BarChart(
-        section=section,
-        title=title,
-        caption=caption,
-        y_label=y_label,
-        names=tuple(names),
-        reference=pick(0, "value"),
-        candidate=pick(1, "value"),
-        replicate=pick(2, "value"),
-        reference_low=pick(0, "low"),
-        reference_high=pick(0, "high"),
-        candidate_low=pick(1, "low"),
-        candidate_high=pick(1, "high"),
-    )
+    numbers = {f"{role}{end}": pick(k, key) for k, role in enumerate(("reference", "candidate"))
+               for end, key in (("", "value"), ("_low", "low"), ("_high", "high"))}  # fmt: skip
+    return BarChart(section, title, caption, y_label, tuple(names), replicate=pick(2, "value"), **numbers)
 
 
 Chart = LineChart | Landscape | BarChart | Histogram

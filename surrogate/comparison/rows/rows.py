@@ -1,4 +1,5 @@
-"""One line of the comparison's table, and what all lines of one comparison are computed from."""
+"""One line of the comparison's table, what all lines of one comparison are computed from, and how each kind is made:
+of a distance between histograms, of a number that each trajectory has by itself, of the column that is furthest off."""
 
 from __future__ import annotations
 
@@ -8,28 +9,31 @@ from dataclasses import dataclass, field, replace
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
 from surrogate.comparison.measure import distributions
 from surrogate.comparison.measure.distributions import Bins
 from surrogate.comparison.measure.statistics import (
     Blocks,
     Estimate,
+    FloatArray,
+    IntArray,
+    Segments,
     bootstrap_weights,
     difference_p,
     estimate,
+    mean_estimate,
     permutation_p,
     pooled,
 )
-from surrogate.comparison.measure.structure import Backbone, Features
+from surrogate.comparison.measure.structure import Backbone, Family, Features, Groups, over_groups
 from surrogate.comparison.read.ensemble import Ensemble
 from surrogate.comparison.rows.charts import Chart, Histogram, jsonable
 from systems.chemistry.validity import Geometry
 from systems.scene import Scene
 from systems.units import GAS_CONSTANT_KJ_MOL_K, format_time_ps
 
-FloatArray = npt.NDArray[np.float64]
-Series = Sequence[Sequence[npt.NDArray[Any]]]
+# Of (reference, candidate, replicate).
+Three = Sequence[Segments]
 Group = Literal["validity", "structure", "populations", "distributions", "kinetics"]
 Form = Literal["share", "distance", "observable"]
 Kind = Literal["validity", "distribution", "kinetics", "information"]
@@ -42,8 +46,8 @@ Word = Literal["agrees", "close", "differs", "fails", "undecided"]
 UNLIKE_BELOW = 1e-3
 # Of a lag, to tell anything at it.
 LEAST_LAGS = 10
-# A population within this factor is 1 kJ/mol away at 300 K.
-ONE_KJ_FACTOR = math.exp(1.0 / (GAS_CONSTANT_KJ_MOL_K * 300.0))
+# The share that a population changes by at 1 kJ/mol and 300 K.
+ONE_KJ_SHARE = 1.0 - 1.0 / math.exp(1.0 / (GAS_CONSTANT_KJ_MOL_K * 300.0))
 # Histograms drawn at a time, as numbers: a hundred MB or so.
 _DRAWN_VALUES = 4e6
 
@@ -101,7 +105,12 @@ class Measured(NamedTuple):
     skipped: Sequence[Skipped] = ()
 
 
-@dataclass(frozen=True)
+def left_out(name: str, why: str) -> Measured:
+    """Return a metric that finds nothing, and why."""
+    return Measured(skipped=[(name, why)])
+
+
+@dataclass(frozen=True, kw_only=True)
 class Row:
     """One metric of one candidate, between the reference and its replicate.
 
@@ -109,21 +118,20 @@ class Row:
     replicate baseline; an "observable" is compared with the reference's own value, and `ratio` is to that; a "share" is
     the part of frames that pass a check. `statement` puts the deviation in words. `p_value` tests the candidate against
     reference and replicate together, `p_replicate` the replicate against the reference; `p_corrected` is Holm's over
-    all rows.
-    `kind` and `time_scale` are those of the `Metric` that measured it.
+    all rows. `kind` and `time_scale` are those of the `Metric` that measured it.
     """
 
     key: str
     group: Group
     metric: str
-    unit: str
+    unit: str = ""
     form: Form
-    reference: Estimate | None
+    reference: Estimate | None = None
     candidate: Estimate
-    replicate: Estimate | None
-    ratio: Estimate | None
+    replicate: Estimate | None = None
+    ratio: Estimate | None = None
     p_value: float
-    p_replicate: float
+    p_replicate: float = math.nan
     tolerance: float
     tolerance_text: str
     statement: str
@@ -152,6 +160,11 @@ class Sample:
     n_equal: int
     equal_weights: FloatArray
 
+    def family(self, family: Family) -> Segments:
+        """Return the columns `(n, k)` of one family per segment, none where nothing was measured."""
+        f = self.features
+        return f.series.get(family) or [np.empty((n, 0), dtype=np.float32) for n in f.segment_lengths]
+
 
 @dataclass(frozen=True, eq=False)
 class ComparisonInput:
@@ -174,6 +187,11 @@ class ComparisonInput:
     trajectories: tuple[Ensemble, Ensemble, Ensemble | None] | None = None
 
     @property
+    def lag_ps(self) -> float:
+        """The time between frames, ps."""
+        return self.reference.features.lag_ps
+
+    @property
     def compared_ps(self) -> float:
         """The equal length, ps."""
         return min(s.features.total_ps for s in self.samples)
@@ -182,6 +200,20 @@ class ComparisonInput:
     def samples(self) -> tuple[Sample, Sample, Sample]:
         """Reference, candidate, replicate."""
         return self.reference, self.candidate, self.replicate
+
+    def families(self, family: Family, *columns: int) -> list[Segments]:
+        """Return the columns `(n, k)` of one family of each sample: those named, or all."""
+        every = [s.family(family) for s in self.samples]
+        return [[x[:, columns] for x in v] for v in every] if columns else every
+
+    def too_short(self, lag_frames: float, trajectories: Sequence[Features] | None = None) -> str:
+        """Return why nothing is estimated at this lag, in words: a trajectory (of the three by default) has no unbroken
+        stretch of `LEAST_LAGS` lags. Empty where all have one."""
+        longest = min(max(f.segment_lengths) for f in trajectories or [s.features for s in self.samples])
+        if longest >= LEAST_LAGS * lag_frames:
+            return ""
+        needed, held = (format_time_ps(n * self.lag_ps, 3) for n in (LEAST_LAGS * lag_frames, longest))
+        return f"it takes {needed} without a break, {LEAST_LAGS} lags, and one of the trajectories holds {held}"
 
 
 def make_sample(
@@ -200,68 +232,59 @@ def make_sample(
     return Sample(features, blocks, weights, n, equal)
 
 
-def too_short(trajectories: Sequence[Features], lag_frames: float) -> str:
-    """Return why nothing is estimated at this lag, in words: a trajectory has no unbroken stretch of `LEAST_LAGS` lags.
-    Empty where all have one."""
-    longest = min(max(f.segment_lengths) for f in trajectories)
-    if longest >= LEAST_LAGS * lag_frames:
-        return ""
-    lag_ps = trajectories[0].lag_ps
-    needed, held = (format_time_ps(n * lag_ps, 3) for n in (LEAST_LAGS * lag_frames, longest))
-    return f"it takes {needed} without a break, {LEAST_LAGS} lags, and one of the trajectories holds {held}"
-
-
 def by_group(rows: Sequence[Row]) -> list[Row]:
     """Return the rows with those of one group together, in the order of `GROUPS`; within a group as they came."""
     return sorted(rows, key=lambda row: GROUPS.index(row.group))
 
 
+def lower_first(name: str) -> str:
+    """Return a name as it stands within a sentence."""
+    return name if name[1:2].isupper() else name[0].lower() + name[1:]
+
+
 def distance_row(
     inputs: ComparisonInput,
     counts: Sequence[FloatArray],
-    *,
     key: str,
     group: Group,
     metric: str,
-    statement: Callable[[float], str],
-    strata: Sequence[npt.NDArray[np.int64]] | None = None,
+    what: str,
+    strata: Sequence[IntArray] | None = None,
 ) -> Row:
     """Return the row of a Jensen-Shannon distance from histograms per block of (reference, candidate, replicate).
 
-    `counts`: three arrays `(n_blocks, n_bins)`, or `(n_blocks, n_series, n_bins)` whose distances are averaged.
-    `statement(ratio)` words the deviation. Distances are those of equal lengths; the p-values are block permutation
-    tests of everything there is. A replicate that differs from the reference does not speak for it: the candidate is
-    then tested against the reference alone. `strata`: the kind of each block of the three; only blocks of one kind are
-    exchanged.
+    `counts`: three arrays `(n_blocks, n_bins)`, or `(n_blocks, n_series, n_bins)` whose distances are averaged. `what`
+    begins the sentence that words the deviation: '... so many times as far off as a replicate's'. Distances are those
+    of equal lengths; the p-values are block permutation tests of everything there is. A replicate that differs from the
+    reference does not speak for it: the candidate is then tested against the reference alone. `strata`: the kind of
+    each block of the three; only blocks of one kind are exchanged.
     """
     ref, cand, rep = (c.reshape(len(c), -1, c.shape[-1]) for c in counts)
     # Bins that nobody visits add nothing to any distance.
     visited = sum(c.sum((0, 1)) for c in (ref, cand, rep)) > 0
-    ref, cand, rep = ref[..., visited], cand[..., visited], rep[..., visited]
-    n_series, n_bins = ref.shape[1:]
+    n_series, n_bins = ref.shape[1], int(visited.sum())
+    flat = [c[..., visited].reshape(len(c), -1) for c in (ref, cand, rep)]
 
     def mean_distance(p: FloatArray, q: FloatArray) -> FloatArray:
         shape = (len(p), n_series, n_bins)
         return np.asarray(distributions.distance(p.reshape(shape), q.reshape(shape)).mean(-1))
 
-    flat = [c.reshape(len(c), -1) for c in (ref, cand, rep)]
     equal = [c[: s.n_equal] for s, c in zip(inputs.samples, flat, strict=True)]
     sums = [c.sum(0)[None] for c in equal]
     to_candidate, to_replicate = float(mean_distance(sums[0], sums[1])[0]), float(mean_distance(sums[0], sums[2])[0])
-    draws_candidate, draws_replicate = drawn_distances(inputs, equal, mean_distance)
+    draws_candidate, draws_replicate = _drawn_distances(inputs, equal, mean_distance)
     n_blocks = min(len(c) for c in equal)
     ratio = Estimate(math.nan)
     if to_replicate > 0:
         with np.errstate(invalid="ignore", divide="ignore"):
             ratio = estimate(to_candidate / to_replicate, draws_candidate / draws_replicate, n_blocks, log=True)
-    p, p_replicate = permutation_pair(inputs, flat, mean_distance, 99, strata)
+    p, p_replicate = _permutation_pair(inputs, flat, mean_distance, strata)
+    words = f"{what} {ratio.value:.2g} times as far off as a replicate's"
     return Row(
         key=key,
         group=group,
         metric=metric,
-        unit="",
         form="distance",
-        reference=None,
         candidate=_distance_estimate(to_candidate, draws_candidate, n_blocks),
         replicate=_distance_estimate(to_replicate, draws_replicate, n_blocks),
         ratio=ratio,
@@ -269,81 +292,69 @@ def distance_row(
         p_replicate=p_replicate,
         tolerance=2.0,
         tolerance_text="≤ 2 × replicate",
-        statement=statement(ratio.value) if math.isfinite(ratio.value) else f"{metric}: not as in the reference",
+        statement=words if math.isfinite(ratio.value) else f"{metric}: not as in the reference",
         divergence=(to_candidate**2, to_replicate**2) if n_series == 1 else None,
     )
 
 
-def series_distance(inputs: ComparisonInput, series: Series, bins: Bins, key: str, name: str, group: Group) -> Row:
+def series_counts(inputs: ComparisonInput, series: Three, bins: Bins) -> list[FloatArray]:
+    """Return histograms per block `(n_blocks, n_bins)` of one series `(n,)` per segment and sample."""
+    return [distributions.block_counts(v, bins, s.blocks) for s, v in zip(inputs.samples, series, strict=True)]
+
+
+def series_distance(inputs: ComparisonInput, series: Three, bins: Bins, key: str, name: str, group: Group) -> Row:
     """Return the Jensen-Shannon distance row of one series `(n,)` per segment and sample."""
-    counts = [distributions.block_counts(v, bins, s.blocks) for s, v in zip(inputs.samples, series, strict=True)]
-    low = name if name[1:2].isupper() else name[0].lower() + name[1:]
-    return distance_row(
-        inputs,
-        counts,
-        key=key,
-        group=group,
-        metric=f"{name}, distance",
-        statement=lambda ratio: f"the distribution of {low} is {ratio:.2g} times as far off as a replicate's",
-    )
+    what = f"the distribution of {lower_first(name)} is"
+    return distance_row(inputs, series_counts(inputs, series, bins), key, group, f"{name}, distance", what)
 
 
 def mean_distance(
     inputs: ComparisonInput,
-    segments: Sequence[Sequence[npt.NDArray[Any]]],
+    segments: Three,
     bins: Sequence[Bins],
     key: str,
     name: str,
     group: Group,
-    groups: Sequence[npt.NDArray[np.intp]] | None = None,
+    groups: Groups | None = None,
 ) -> Row:
     """Return the row of the mean Jensen-Shannon distance over the columns `(n, k)`, one `Bins` each.
 
     With `groups` of equal columns, one histogram and one `Bins` a group.
     """
-    chosen = [np.array([k]) for k in range(len(bins))] if groups is None else groups
-    counts = [
-        np.stack([distributions.grouped_counts(v, g, own, s.blocks) for g, own in zip(chosen, bins, strict=True)], 1)
-        for s, v in zip(inputs.samples, segments, strict=True)
-    ]
-    what = f"{name}, distance" if len(bins) == 1 else f"{name}, mean distance of {len(bins)}"
-    low = name[0].lower() + name[1:]
-    return distance_row(
-        inputs,
-        counts,
-        key=key,
-        group=group,
-        metric=what,
-        statement=lambda ratio: f"{low}: distributions {ratio:.2g} times as far off as a replicate's",
-    )
+    chosen = [[k] for k in range(len(bins))] if groups is None else [g.tolist() for g in groups]
+
+    def counts(sample: Sample, values: Segments) -> FloatArray:
+        each = [[distributions.block_counts([x[:, k] for x in values], own, sample.blocks) for k in g]
+                for g, own in zip(chosen, bins, strict=True)]  # fmt: skip
+        return np.stack([np.sum(x, axis=0) for x in each], axis=1)
+
+    three = [counts(s, v) for s, v in zip(inputs.samples, segments, strict=True)]
+    metric = f"{name}, distance" if len(bins) == 1 else f"{name}, mean distance of {len(bins)}"
+    return distance_row(inputs, three, key, group, metric, f"{lower_first(name)}: distributions")
 
 
-def histogram(inputs: ComparisonInput, series: Series, bins: Bins, label: str, unit: str) -> Histogram:
+def histogram(inputs: ComparisonInput, series: Three, bins: Bins, label: str, unit: str) -> Histogram:
     """Return the densities of (reference, candidate, replicate), normalised over all frames, in range or not."""
     width = (bins.high - bins.low) / bins.n
-    densities, outside = [], []
-    for sample, segments in zip(inputs.samples, series, strict=True):
-        counts = distributions.block_counts(segments, bins, sample.blocks).sum(0)
-        densities.append(counts[: bins.n] / counts.sum() / width)
-        outside.append(float(counts[bins.n :].sum() / counts.sum()))
-    ref, cand, rep = densities
+    counts = [c.sum(0) for c in series_counts(inputs, series, bins)]
+    ref, cand, rep = (c[: bins.n] / c.sum() / width for c in counts)
+    outside = [float(c[bins.n :].sum() / c.sum()) for c in counts]
     return Histogram(label, unit, bins.edges, ref, cand, rep, (outside[0], outside[1], outside[2]))
 
 
-Distance = Callable[[FloatArray, FloatArray], FloatArray]
+_Distance = Callable[[FloatArray, FloatArray], FloatArray]
 
 
-def drawn_distances(
-    inputs: ComparisonInput, equal: Sequence[FloatArray], distance: Distance
+def _drawn_distances(
+    inputs: ComparisonInput, equal: Sequence[FloatArray], distance: _Distance
 ) -> tuple[FloatArray, FloatArray]:
     """Return bootstrap draws `(n_draws,)` of the distances of candidate and replicate to the reference.
 
     `equal`: sums over the equally long parts of (reference, candidate, replicate), `(n_blocks, n_sums)`.
     """
     found: tuple[list[FloatArray], list[FloatArray]] = ([], [])
-    n_draws = inputs.options.n_bootstrap
     batch = max(1, int(_DRAWN_VALUES // max(equal[0].shape[1], 1)))
-    for start in range(0, n_draws, batch):
+    for start in range(0, inputs.options.n_bootstrap, batch):
         ref, cand, rep = (
             s.equal_weights[start : start + batch] @ c for s, c in zip(inputs.samples, equal, strict=True)
         )
@@ -352,32 +363,23 @@ def drawn_distances(
     return np.concatenate(found[0]), np.concatenate(found[1])
 
 
-def permutation_pair(
-    inputs: ComparisonInput,
-    flat: Sequence[FloatArray],
-    distance: Distance,
-    stream: int,
-    strata: Sequence[npt.NDArray[np.int64]] | None = None,
+def _permutation_pair(
+    inputs: ComparisonInput, flat: Sequence[FloatArray], distance: _Distance, strata: Sequence[IntArray] | None
 ) -> tuple[float, float]:
     """Return the p-values of the candidate and of the replicate by block permutation; see `distance_row`.
 
     `flat`: sums over all blocks of (reference, candidate, replicate), `(n_blocks, n_sums)`.
     """
-    ref, cand, rep = flat
-    n = inputs.options.n_permutations
-    rng = np.random.default_rng([inputs.options.seed, stream])
+    rng = np.random.default_rng([inputs.options.seed, 99])
     kinds = [np.zeros(len(c), dtype=np.int64) for c in flat] if strata is None else strata
-    of_replicate = permutation_p(ref, rep, distance, rng, n, np.concatenate([kinds[0], kinds[2]]))
-    source = [0] if of_replicate < UNLIKE_BELOW else [0, 2]
-    p = permutation_p(
-        np.concatenate([flat[k] for k in source]),
-        cand,
-        distance,
-        rng,
-        n,
-        np.concatenate([*(kinds[k] for k in source), kinds[1]]),
-    )
-    return p, of_replicate
+
+    def p(sources: list[int], other: int) -> float:
+        counts = np.concatenate([flat[k] for k in sources])
+        of_block = np.concatenate([kinds[k] for k in (*sources, other)])
+        return permutation_p(counts, flat[other], distance, rng, inputs.options.n_permutations, of_block)
+
+    of_replicate = p([0], 2)
+    return p([0] if of_replicate < UNLIKE_BELOW else [0, 2], 1), of_replicate
 
 
 def reference_of(reference: Estimate, replicate: Estimate, *, log: bool = False) -> Estimate:
@@ -434,4 +436,116 @@ def observable_row(
         tolerance=metric.tolerance * ref.value if log else metric.tolerance,
         tolerance_text=metric.tolerance_text or f"± {metric.tolerance_words()}",
         statement=statement(cand.value, ref.value) if math.isfinite(cand.value) else f"{metric.name}: it does not move",
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class Means:
+    """The mean of every column `(k,)` and its bootstrap draws `(n_draws, k)`, from `n_blocks` blocks."""
+
+    values: FloatArray
+    draws: FloatArray
+    n_blocks: int
+
+    def estimates(self, columns: Sequence[int] | None = None) -> list[Estimate]:
+        """Return each mean with its interval, of all columns or of some."""
+        chosen = range(len(self.values)) if columns is None else columns
+        return [estimate(float(self.values[k]), self.draws[:, k], self.n_blocks) for k in chosen]
+
+    def times(self, factor: float) -> Means:
+        """Return the means in another unit."""
+        return Means(factor * self.values, factor * self.draws, self.n_blocks)
+
+    def over(self, groups: Groups) -> Means:
+        """Return the mean over each group of equal columns."""
+        return Means(over_groups(self.values, groups), over_groups(self.draws, groups), self.n_blocks)
+
+
+Limits = tuple[FloatArray, FloatArray]
+
+
+def bounds(segments: Segments) -> Limits:
+    """Return the least and greatest finite value of every column `(k,)`, each a whole range further out.
+
+    Values beyond count as these: an exploded frame is the validity checks' to report, and must not drown the others.
+    """
+    with np.errstate(invalid="ignore"):
+        finite = [np.where(np.isfinite(s), s, np.nan) for s in segments]
+        low = np.min([np.nanmin(s, axis=0, initial=np.inf) for s in finite], axis=0)
+        high = np.max([np.nanmax(s, axis=0, initial=-np.inf) for s in finite], axis=0)
+        width = np.nan_to_num(high - low, nan=0.0, posinf=0.0, neginf=0.0)
+        return low - width, high + width
+
+
+def block_means(sample: Sample, segments: Segments, limits: Limits | None = None) -> Means:
+    """Return the mean of every column of `segments` `(n, k)`, values kept within `limits`; those that are not finite
+    are left out."""
+    n_columns = segments[0].shape[1]
+    total, count = np.zeros((2, sample.blocks.n_blocks, n_columns))
+    for piece in sample.blocks.pieces:
+        part = segments[piece.segment][piece.start : piece.stop].astype(np.float64)
+        finite = np.isfinite(part)
+        if limits is not None:
+            with np.errstate(invalid="ignore"):
+                part = np.clip(part, *limits)
+        total[piece.block] += np.where(finite, part, 0.0).sum(axis=0)
+        count[piece.block] += finite.sum(axis=0)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        values, draws = total.sum(axis=0) / count.sum(axis=0), (sample.weights @ total) / (sample.weights @ count)
+        return Means(values, draws, sample.blocks.n_blocks)
+
+
+def three_means(inputs: ComparisonInput, series: Three, *, limited: bool = False) -> list[Means]:
+    """Return the means of the columns of each sample, values kept within the reference's `bounds` where `limited`."""
+    limits = bounds(series[0]) if limited else None
+    return [block_means(s, v, limits) for s, v in zip(inputs.samples, series, strict=True)]
+
+
+def mean_row(
+    inputs: ComparisonInput, metric: Quantity, means: Sequence[Means], k: int, statement: Callable[[float, float], str]
+) -> Row:
+    """Return the row of the mean of column `k`, from `means` of (reference, candidate, replicate); see
+    `observable_row`."""
+    values, draws = [float(m.values[k]) for m in means], [m.draws[:, k] for m in means]
+    return observable_row(inputs, metric, values, draws, statement)
+
+
+def shift_row(
+    inputs: ComparisonInput,
+    metric: Quantity,
+    means: Sequence[Means],
+    labels: Sequence[str],
+    statement: Callable[[str, float, float], str],
+) -> Row:
+    """Return the row of the column whose mean is furthest off, from `means` of (reference, candidate, replicate).
+
+    `labels` name the columns, and the worst one's stands in the row's name. The p-value is the least over all columns
+    times their number (Bonferroni). `statement(label, candidate, reference)` words the deviation.
+    """
+    ref, cand, rep = means
+    shift, replicate_baseline = np.abs(cand.values - ref.values), np.abs(rep.values - ref.values)
+    worst = int(np.nanargmax(shift)) if np.isfinite(shift).any() else 0
+    at = int(np.nanargmax(replicate_baseline)) if np.isfinite(replicate_baseline).any() else 0
+    sign = np.sign(cand.values[worst] - ref.values[worst])
+    n_blocks = min(m.n_blocks for m in means)
+    found = estimate(float(shift[worst]), sign * (cand.draws[:, worst] - ref.draws[:, worst]), n_blocks)
+    least = [1.0, 1.0]
+    for k in range(len(shift)):
+        r, c, other = (mean_estimate(float(m.values[k]), m.draws[:, k], m.n_blocks) for m in means)
+        for side, (x, y) in enumerate(((c, reference_of(r, other)), (other, r))):
+            if abs(x.value - y.value) > metric.resolution:
+                least[side] = min(least[side], difference_p(x, y) * len(shift))
+    return Row(
+        key=metric.key,
+        group=metric.group,
+        metric=f"{metric.name}: {labels[worst]}",
+        unit=metric.unit,
+        form="distance",
+        candidate=replace(found, low=max(found.low, 0.0)),
+        replicate=Estimate(float(replicate_baseline[at]), error=float((rep.draws - ref.draws)[:, at].std())),
+        p_value=least[0] if math.isfinite(float(shift[worst])) else math.nan,
+        p_replicate=least[1],
+        tolerance=metric.tolerance,
+        tolerance_text=metric.tolerance_text or f"≤ {metric.tolerance_words()}",
+        statement=statement(labels[worst], float(cand.values[worst]), float(ref.values[worst])),
     )

@@ -1,4 +1,5 @@
-"""Torsions: populations of basins, rare ones as free energies, distributions of φ and ψ and of all others.
+"""Torsions: populations of basins, rare ones as free energies, distributions of φ and ψ and of all others; and what
+moves fast: torsions within the states of slower ones and steps from frame to frame, in blocks of their own.
 
 Some states MD enters so seldom that their populations are luck. A residue with phi > 0 that is entered once in 100 ns
 holds none or five percent of a trajectory's frames, and whatever compares frames by number calls two runs of one
@@ -13,33 +14,49 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-import numpy.typing as npt
 
-from surrogate.comparison.measure import distributions
+from surrogate.comparison.measure import distributions, kinetics
 from surrogate.comparison.measure.distributions import RAMACHANDRAN_BINS, TORSION_BINS, block_counts_joint
-from surrogate.comparison.measure.probes import MOST_HISTOGRAMS, evenly
-from surrogate.comparison.measure.structure import Residue
+from surrogate.comparison.measure.slow_motion import slow_torsions, tica_features
+from surrogate.comparison.measure.statistics import (
+    BLOCK_IN_CORRELATION_TIMES,
+    MAX_BLOCKS,
+    AnyFloat,
+    Blocks,
+    BoolArray,
+    FloatArray,
+    IntArray,
+    Segments,
+    make_blocks,
+)
+from surrogate.comparison.measure.structure import MOST_HISTOGRAMS, Features, Residue, evenly
 from surrogate.comparison.measure.torsions import Kind as TorsionKind
-from surrogate.comparison.rows.block_means import block_means, column, family_of, mean_row, shift_row
 from surrogate.comparison.rows.charts import Chart, Landscape
 from surrogate.comparison.rows.rows import (
-    ONE_KJ_FACTOR,
+    ONE_KJ_SHARE,
     ComparisonInput,
-    Group,
     Measured,
     Quantity,
     Row,
     Sample,
     Skipped,
+    Three,
     distance_row,
     histogram,
+    left_out,
+    make_sample,
     mean_distance,
+    mean_row,
     observable_row,
+    series_counts,
     series_distance,
+    shift_row,
+    three_means,
 )
+from systems.units import format_time_ps
 
-FloatArray = npt.NDArray[np.float64]
-AnyFloat = npt.NDArray[np.floating]
+# Of (reference, candidate, replicate): the state of each frame `(n,)` per segment, -1 for none.
+States = Sequence[Sequence[IntArray]]
 
 # More residues than this, and they share rows: means over all, and the one that is furthest off.
 FEW_RESIDUES = 12
@@ -48,35 +65,33 @@ _MOST_DRAWN = 24
 _LARGEST = Quantity(
     "population_shift", "populations", "Largest shift of a basin's population", "%", 5.0, resolution=0.1
 )
-_PHI_PSI: tuple[
-    tuple[str, Callable[[ComparisonInput], tuple[str, ...]], Callable[[Sample], Sequence[AnyFloat]]], ...
-] = (
-    ("φ", lambda inputs: inputs.torsions.phi_labels, lambda s: s.features.phi),
-    ("ψ", lambda inputs: inputs.torsions.psi_labels, lambda s: s.features.psi),
-)
 # Fewer visits than this in all MD of a comparison, and a smaller share of its frames, make a state rare.
-_FEW_VISITS = 10
-_SMALL_SHARE = 0.1
+_FEW_VISITS, _SMALL_SHARE = 10, 0.1
 # Between the cores a frame counts as where it came from, so that trembling on the rim is no visit.
 _CORE = (math.radians(20.0), math.radians(160.0))
 # 1 kJ/mol at 300 K.
 _TOLERANCE_KT = 0.4
 _DRAWS = 400
-
 # More of one kind than this, and they share one row.
-_MANY = 6
-_MAX_SERIES = 64
+_MANY, _MAX_SERIES = 6, 64
 _NAMES: dict[TorsionKind, str] = {
     "ω": "Peptide torsions ω",
     "χ": "Side-chain torsions χ",
     "rotatable": "Rotatable torsions",
     "rotor": "Rotors (methyl, hydroxyl, ammonium)",
 }
-_WITHOUT_CHANGED = "Distributions without frames that guards changed"
-_LEAST_SHARE = 0.1
+_WITHOUT_CHANGED, _LEAST_UNCHANGED = "Distributions without frames that guards changed", 0.1
+# A state that holds less of the frames of any of the three is left out of what moves within states.
+_LEAST_SHARE = 0.05
+_MOST_TORSIONS = 8
+_LEAST_IN_STATE = 0.01
+_N_STATES = 4
+_STREAM = 40
+_TICA_LAG_PS = 10.0
+_WITHOUT_STRAYS = (0.0005, 0.9995)
 
 
-def are_many(inputs: ComparisonInput) -> bool:
+def _are_many(inputs: ComparisonInput) -> bool:
     """Whether residues are too many for rows of their own."""
     return max(len(inputs.torsions.phi), len(inputs.torsions.psi)) > FEW_RESIDUES
 
@@ -87,16 +102,19 @@ def population_rows(inputs: ComparisonInput) -> Measured:
     found = [("ψ in the β basin", x) for x in inputs.torsions.psi_labels]
     found += [("φ > 0", x) for x in inputs.torsions.phi_labels]
     n_psi = len(inputs.torsions.psi_labels)
+    skipped: list[Skipped] = []
+    if not found:
+        skipped.append(("Torsion distributions, basins, autocorrelation", "the scene has no φ or ψ torsion"))
+    elif not inputs.torsions.residues:
+        skipped.append(("Joint φ/ψ maps", "no residue has both torsions"))
 
-    def members(sample: Sample) -> list[FloatArray]:
-        parts = zip(sample.features.phi, sample.features.psi, strict=True)
-        return [
-            100.0 * np.concatenate([distributions.is_beta(psi), distributions.is_positive(phi)], axis=1)
-            for phi, psi in parts
-        ]
+    def members(f: Features) -> list[AnyFloat]:
+        angles = zip(f.phi, f.psi, strict=True)
+        basins = [(distributions.is_beta(psi), distributions.is_positive(phi)) for phi, psi in angles]
+        return [100.0 * np.concatenate(both, axis=1) for both in basins]
 
-    means = [block_means(s, members(s)) for s in inputs.samples]
-    if are_many(inputs):
+    means = three_means(inputs, [members(s.features) for s in inputs.samples])
+    if _are_many(inputs):
         return Measured([shift_row(inputs, _LARGEST, means, [", ".join(x) for x in found], _instead)])
     rows, rare = [], rare_residues(inputs)
     for k, (name, label) in enumerate(found):
@@ -104,22 +122,23 @@ def population_rows(inputs: ComparisonInput) -> Measured:
             rows.append(free_energy_row(inputs, k - n_psi, label))
             continue
         share = float(means[0].values[k])
-        tolerance = min(share, 100.0 - share) * (1.0 - 1.0 / ONE_KJ_FACTOR)
-        key = f"population:{name}:{label}"
-        quantity = Quantity(key, "populations", f"{name}, {label}", "%", tolerance, "± 1 kJ/mol")
-        rows.append(mean_row(inputs, quantity, means, k, _held(name, label)))
-    return Measured(rows)
+        tolerance = min(share, 100.0 - share) * ONE_KJ_SHARE
+        quantity = Quantity(
+            f"population:{name}:{label}", "populations", f"{name}, {label}", "%", tolerance, "± 1 kJ/mol"
+        )
+        rows.append(mean_row(inputs, quantity, means, k, _held(f"{name} of {label}")))
+    return Measured(rows, skipped=skipped)
 
 
 def _instead(label: str, candidate: float, reference: float) -> str:
     return f"{label}: {candidate:.3g} % of frames instead of {reference:.3g} %"
 
 
-def _held(name: str, label: str) -> Callable[[float, float], str]:
+def _held(what: str) -> Callable[[float, float], str]:
     def statement(candidate: float, reference: float) -> str:
         if candidate == 0.0:
-            return f"{name} of {label} is never visited (reference {reference:.3g} %)"
-        return f"{name} of {label} holds {candidate:.3g} % instead of {reference:.3g} %"
+            return f"{what} is never visited (reference {reference:.3g} %)"
+        return f"{what} holds {candidate:.3g} % instead of {reference:.3g} %"
 
     return statement
 
@@ -128,31 +147,45 @@ def torsion_rows(inputs: ComparisonInput) -> Measured:
     """Return Jensen-Shannon distances: jointly per residue (50 x 50 bins), then phi and psi alone (100 bins); of many
     residues their means. Where phi > 0 is rare it is left out of the map and of phi. Maps and histograms are drawn of
     all, of many residues of some."""
-    rows = _mean_torsion_rows(inputs) if are_many(inputs) else _single_torsion_rows(inputs)
+    rows = _mean_torsion_rows(inputs) if _are_many(inputs) else _single_torsion_rows(inputs)
     of_map = {row.key: row for row in rows}
     charts: list[Chart] = [
         _map(inputs, residue, of_map.get(f"joint_jsd:{residue.label}"))
         for residue in evenly(inputs.torsions.residues, _MOST_DRAWN)
     ]
-    for symbol, labels, pick in _PHI_PSI:
-        for k, label in evenly(list(enumerate(labels(inputs))), _MOST_DRAWN):
-            series = [[x[:, k] for x in pick(s)] for s in inputs.samples]
-            charts.append(histogram(inputs, series, TORSION_BINS, f"{symbol} {label}", "rad"))
+    for symbol, key, labels in _phi_psi(inputs):
+        for k, label in evenly(list(enumerate(labels)), _MOST_DRAWN):
+            charts.append(histogram(inputs, _angle(inputs, key, k), TORSION_BINS, f"{symbol} {label}", "rad"))
     return Measured(rows, charts)
+
+
+def _phi_psi(inputs: ComparisonInput) -> list[tuple[str, str, tuple[str, ...]]]:
+    return [("φ", "phi", inputs.torsions.phi_labels), ("ψ", "psi", inputs.torsions.psi_labels)]
+
+
+def _angle(inputs: ComparisonInput, key: str, k: int) -> Three:
+    """Return one of the angles phi or psi `(n,)` per segment of each sample."""
+    return [[x[:, k] for x in getattr(s.features, key)] for s in inputs.samples]
+
+
+def joint_counts(f: Features, blocks: Blocks, residue: Residue) -> FloatArray:
+    """Return the φ/ψ map of a residue per block, `(n_blocks, n_bins)`."""
+    phi, psi = [x[:, residue.phi] for x in f.phi], [x[:, residue.psi] for x in f.psi]
+    return block_counts_joint(phi, psi, RAMACHANDRAN_BINS, blocks)
 
 
 def _map(inputs: ComparisonInput, residue: Residue, row: Row | None) -> Landscape:
     """Counts over φ and ψ; captions with the distances of the residue's row, where it has one."""
     n, n_total = RAMACHANDRAN_BINS.n, RAMACHANDRAN_BINS.n_total
-    ref, cand, rep = (_joint_counts(s, residue).sum(0).reshape(n_total, n_total)[:n, :n] for s in inputs.samples)
+    counts = [joint_counts(s.features, s.blocks, residue).sum(0) for s in inputs.samples]
+    ref, cand, rep = (c.reshape(n_total, n_total)[:n, :n] for c in counts)
     edges = np.degrees(RAMACHANDRAN_BINS.edges)
     captions = ("Reference", "Candidate", "Replicate")
     if row is not None and row.replicate is not None:
-        apart, replicate_baseline = row.candidate.value, row.replicate.value
         captions = (
-            captions[0],
-            f"Candidate: distance {apart:.3g} to the reference",
-            f"Replicate: distance {replicate_baseline:.3g}, the replicate baseline",
+            "Reference",
+            f"Candidate: distance {row.candidate.value:.3g} to the reference",
+            f"Replicate: distance {row.replicate.value:.3g}, the replicate baseline",
         )
     title = f"φ and ψ of {residue.label}"
     return Landscape("distributions", title, "φ / °", "ψ / °", edges, edges, ref, cand, rep, captions)
@@ -161,62 +194,38 @@ def _map(inputs: ComparisonInput, residue: Residue, row: Row | None) -> Landscap
 def _single_torsion_rows(inputs: ComparisonInput) -> list[Row]:
     rows, rare = [], rare_residues(inputs)
     for residue in inputs.torsions.residues:
-        counts = [_joint_counts(s, residue) for s in inputs.samples]
+        counts = [joint_counts(s.features, s.blocks, residue) for s in inputs.samples]
         what = "Joint φ/ψ"
         if residue.phi in rare:
             counts, what = [without_positive_phi(c, RAMACHANDRAN_BINS.n) for c in counts], f"{what} at φ < 0"
-        rows.append(_jsd_row(inputs, counts, "joint_jsd", what, residue.label, "distributions"))
-    for symbol, labels, pick in _PHI_PSI:
-        for k, label in enumerate(labels(inputs)):
-            counts = [
-                distributions.block_counts([x[:, k] for x in pick(s)], TORSION_BINS, s.blocks) for s in inputs.samples
-            ]
-            key, what = "phi_jsd" if symbol == "φ" else "psi_jsd", symbol
-            if symbol == "φ" and k in rare:
+        rows.append(_jsd_row(inputs, counts, "joint_jsd", what, residue.label))
+    for symbol, key, labels in _phi_psi(inputs):
+        for k, label in enumerate(labels):
+            counts, what = series_counts(inputs, _angle(inputs, key, k), TORSION_BINS), symbol
+            if key == "phi" and k in rare:
                 counts, what = [without_positive_phi(c, TORSION_BINS.n) for c in counts], f"{symbol} at φ < 0"
-            rows.append(_jsd_row(inputs, counts, key, what, label, "distributions"))
+            rows.append(_jsd_row(inputs, counts, f"{key}_jsd", what, label))
     return rows
-
-
-def _joint_counts(sample: Sample, residue: Residue) -> FloatArray:
-    phi, psi = (
-        [x[:, k] for x in series]
-        for series, k in ((sample.features.phi, residue.phi), (sample.features.psi, residue.psi))
-    )
-    return distributions.block_counts_joint(phi, psi, RAMACHANDRAN_BINS, sample.blocks)
 
 
 def _mean_torsion_rows(inputs: ComparisonInput) -> list[Row]:
     rows = []
     residues = evenly(inputs.torsions.residues, MOST_MAPS)
     if residues:
-        counts = [np.stack([_joint_counts(s, r) for r in residues], axis=1) for s in inputs.samples]
-        rows.append(
-            _jsd_row(inputs, counts, "joint_jsd", "Joint φ/ψ", f"mean of {len(residues)} residues", "distributions")
-        )
-    for symbol, _, pick in _PHI_PSI:
-        key = "phi_jsd" if symbol == "φ" else "psi_jsd"
-        columns = evenly(range(pick(inputs.reference)[0].shape[1]), MOST_HISTOGRAMS)
+        counts = [np.stack([joint_counts(s.features, s.blocks, r) for r in residues], axis=1) for s in inputs.samples]
+        rows.append(_jsd_row(inputs, counts, "joint_jsd", "Joint φ/ψ", f"mean of {len(residues)} residues"))
+    for symbol, key, labels in _phi_psi(inputs):
+        columns = evenly(range(len(labels)), MOST_HISTOGRAMS)
         if columns:
-            counts = [
-                np.stack(
-                    [distributions.block_counts([x[:, k] for x in pick(s)], TORSION_BINS, s.blocks) for k in columns], 1
-                )
-                for s in inputs.samples
-            ]
-            rows.append(_jsd_row(inputs, counts, key, symbol, f"mean of {len(columns)} residues", "distributions"))
+            each = [series_counts(inputs, _angle(inputs, key, k), TORSION_BINS) for k in columns]
+            counts = [np.stack(of_sample, axis=1) for of_sample in zip(*each, strict=True)]
+            rows.append(_jsd_row(inputs, counts, f"{key}_jsd", symbol, f"mean of {len(columns)} residues"))
     return rows
 
 
-def _jsd_row(
-    inputs: ComparisonInput, counts: Sequence[FloatArray], key: str, what: str, label: str, group: Group
-) -> Row:
-    def statement(ratio: float) -> str:
-        return f"the {what} distribution of {label} is {ratio:.2g} times as far from the reference as a replicate's"
-
-    return distance_row(
-        inputs, counts, key=f"{key}:{label}", group=group, metric=f"{what} distance, {label}", statement=statement
-    )
+def _jsd_row(inputs: ComparisonInput, counts: Sequence[FloatArray], key: str, what: str, label: str) -> Row:
+    words = f"the {what} distribution of {label} is"
+    return distance_row(inputs, counts, f"{key}:{label}", "distributions", f"{what} distance, {label}", words)
 
 
 @dataclass(frozen=True)
@@ -232,7 +241,7 @@ class Visits:
         return Visits(self.visits + other.visits, self.inside + other.inside, self.n_frames + other.n_frames)
 
 
-def visits_of(phi: Sequence[npt.NDArray[np.floating]]) -> Visits:
+def visits_of(phi: Sequence[AnyFloat]) -> Visits:
     """Return the visits to phi > 0 of segments `(n,)` rad."""
     visits = inside = 0
     for segment in phi:
@@ -253,7 +262,7 @@ def rare_residues(inputs: ComparisonInput) -> frozenset[int]:
     small share of their frames, and which any of the three visits at all."""
     found = []
     for k in range(len(inputs.torsions.phi_labels)):
-        reference, candidate, replicate = (_visits(s, k) for s in inputs.samples)
+        reference, candidate, replicate = map(visits_of, _angle(inputs, "phi", k))
         source = reference + replicate
         small = source.inside < _SMALL_SHARE * source.n_frames
         if source.visits < _FEW_VISITS and small and source.visits + candidate.visits:
@@ -268,36 +277,30 @@ def free_energy_row(inputs: ComparisonInput, k: int, label: str) -> Row:
     of none the free energy is that of half a visit. The p-value is of the free energies, or of the visits if that is
     less (exact: which trajectory a visit falls into is a matter of their lengths), in either case doubled.
     """
-    found = [_visits(s, k) for s in inputs.samples]
-    of_all = sum(found[1:], found[0])
+    found = list(map(visits_of, _angle(inputs, "phi", k)))
+    reference, candidate, replicate = found
+    of_all = reference + candidate + replicate
     length = of_all.inside / of_all.visits
     shares = [(v.inside if v.visits else 0.5 * length) / v.n_frames for v in found]
     values = [math.log((1.0 - p) / p) if p < 1.0 else -math.log(v.n_frames) for p, v in zip(shares, found, strict=True)]
     errors = [math.sqrt(2.0 / max(v.visits, 0.5)) for v in found]
     normal = np.random.default_rng([inputs.options.seed, k]).normal(size=(3, _DRAWS))
+    n = candidate.visits
+    seen = f"visited {n} {'time' if n == 1 else 'times'}" if n else "never visited"
 
-    def statement(candidate: float, reference: float) -> str:
-        n = found[1].visits
-        seen = f"visited {n} {'time' if n == 1 else 'times'}" if n else "never visited"
-        return f"φ > 0 of {label} is {seen}, {candidate:.2g} kT above φ < 0 instead of {reference:.2g} kT"
+    def statement(own: float, theirs: float) -> str:
+        return f"φ > 0 of {label} is {seen}, {own:.2g} kT above φ < 0 instead of {theirs:.2g} kT"
 
-    metric = Quantity(
-        f"free_energy:φ > 0:{label}", "populations", f"Free energy of φ > 0, {label}", "kT", _TOLERANCE_KT,
-        tolerance_text="± 1 kJ/mol",
-    )  # fmt: skip
+    key, name = f"free_energy:φ > 0:{label}", f"Free energy of φ > 0, {label}"
+    metric = Quantity(key, "populations", name, "kT", _TOLERANCE_KT, "± 1 kJ/mol")
     draws = [v + e * n for v, e, n in zip(values, errors, normal, strict=True)]
     row = observable_row(inputs, metric, values, draws, statement)
-    reference, candidate, replicate = found
     return replace(
         row,
         ratio=None,
         p_value=_lesser(row.p_value, visits_p(candidate, reference + replicate)),
         p_replicate=_lesser(row.p_replicate, visits_p(replicate, reference)),
     )
-
-
-def _visits(sample: Sample, k: int) -> Visits:
-    return visits_of([phi[:, k] for phi in sample.features.phi])
 
 
 def visits_p(a: Visits, b: Visits) -> float:
@@ -333,36 +336,26 @@ def other_torsion_rows(inputs: ComparisonInput) -> Measured:
     rows: list[Row] = []
     charts: list[Chart] = []
     skipped: list[Skipped] = []
-    measured = [family_of(s, "torsions") for s in inputs.samples]
+    measured = inputs.families("torsions")
     for kind, name in _NAMES.items():
         chosen = [k for k, torsion in enumerate(probes.torsions) if torsion.kind == kind]
         if not chosen:
             skipped.append((name, "the scene has none"))
         elif kind in ("χ", "rotatable") and len(chosen) <= _MANY:
             for k in chosen:
-                series = [column(v, k) for v in measured]
-                label = _folded(probes.torsions[k].label, probes.torsions[k].fold)
-                rows.append(
-                    series_distance(inputs, series, TORSION_BINS, f"torsion_jsd:{label}", label, "distributions")
-                )
+                series = [[x[:, k] for x in v] for v in measured]
+                label, fold = probes.torsions[k].label, probes.torsions[k].fold
+                label += "" if fold == 1 else f" ({fold} equal positions folded: {fold} times the angle)"
+                key = f"torsion_jsd:{label}"
+                rows.append(series_distance(inputs, series, TORSION_BINS, key, label, "distributions"))
                 charts.append(histogram(inputs, series, TORSION_BINS, label, "rad"))
         else:
-            few = _spread(chosen)
+            few = evenly(chosen, _MAX_SERIES)
             if len(few) < len(chosen):
                 skipped.append((f"Some of the {len(chosen)} {name}", f"{len(few)}, evenly chosen, enter the mean"))
-            picked = [[x[:, few] for x in v] for v in measured]
-            bins = [TORSION_BINS] * len(few)
+            picked, bins = inputs.families("torsions", *few), [TORSION_BINS] * len(few)
             rows.append(mean_distance(inputs, picked, bins, f"torsions_jsd:{kind}", name, "distributions"))
     return Measured(rows, charts, skipped)
-
-
-def _spread(chosen: Sequence[int]) -> list[int]:
-    step = -(-len(chosen) // _MAX_SERIES)
-    return list(chosen[::step])
-
-
-def _folded(label: str, fold: int) -> str:
-    return label if fold == 1 else f"{label} ({fold} equal positions folded: {fold} times the angle)"
 
 
 def intervention_rows(inputs: ComparisonInput) -> Measured:
@@ -376,41 +369,268 @@ def intervention_rows(inputs: ComparisonInput) -> Measured:
         return Measured()
     share = float(np.concatenate(list(changed)).mean())
     if share == 0.0:
-        return Measured(skipped=[(_WITHOUT_CHANGED, "the guards changed no frame")])
-    if share > 1.0 - _LEAST_SHARE:
-        return Measured(skipped=[(_WITHOUT_CHANGED, f"{100 * share:.3g} % of the frames were changed")])
+        return left_out(_WITHOUT_CHANGED, "the guards changed no frame")
+    if share > 1.0 - _LEAST_UNCHANGED:
+        return left_out(_WITHOUT_CHANGED, f"{100 * share:.3g} % of the frames were changed")
     rows = []
     for residue in inputs.torsions.residues:
         where = f"{residue.label}, without the {100 * share:.2g} % that guards changed"
-
-        def statement(ratio: float, where: str = where) -> str:
-            return f"the φ/ψ distribution of {where}, is {ratio:.2g} times as far from the reference as a replicate's"
-
-        rows.append(
-            distance_row(
-                inputs,
-                [_counts(s, residue.phi, residue.psi) for s in inputs.samples],
-                key=f"joint_jsd_unchanged:{residue.label}",
-                group="distributions",
-                metric=f"Joint φ/ψ distance, {where}",
-                statement=statement,
-            )
-        )
-    return Measured(rows, [], [])
+        key, metric = f"joint_jsd_unchanged:{residue.label}", f"Joint φ/ψ distance, {where}"
+        counts = [_unchanged_counts(s, residue) for s in inputs.samples]
+        rows.append(distance_row(inputs, counts, key, "distributions", metric, f"the φ/ψ distribution of {where}, is"))
+    return Measured(rows)
 
 
-def _counts(sample: Sample, phi: int, psi: int) -> FloatArray:
+def _unchanged_counts(sample: Sample, residue: Residue) -> FloatArray:
     """Joint histograms per block `(n_blocks, n_bins)` of the frames that nothing was done about."""
-    features = sample.features
-    x, y = [s[:, phi] for s in features.phi], [s[:, psi] for s in features.psi]
-    counts = block_counts_joint(x, y, RAMACHANDRAN_BINS, sample.blocks)
-    if features.changed is None:
+    f, n = sample.features, RAMACHANDRAN_BINS.n_total
+    counts = joint_counts(f, sample.blocks, residue)
+    if f.changed is None:
         return counts
-    n = RAMACHANDRAN_BINS.n_total
     for piece in sample.blocks.pieces:
         part = slice(piece.start, piece.stop)
-        gone = features.changed[piece.segment][part]
-        index = RAMACHANDRAN_BINS.index(x[piece.segment][part][gone]) * n
-        index += RAMACHANDRAN_BINS.index(y[piece.segment][part][gone])
+        gone = f.changed[piece.segment][part]
+        phi, psi = f.phi[piece.segment][part, residue.phi][gone], f.psi[piece.segment][part, residue.psi][gone]
+        index = RAMACHANDRAN_BINS.index(phi) * n + RAMACHANDRAN_BINS.index(psi)
         counts[piece.block] -= np.bincount(index, minlength=n * n)
     return counts
+
+
+def within_rows(inputs: ComparisonInput) -> Measured:
+    """Return rows of phi given psi's basin of every residue (of other molecules: of every rotatable torsion given the
+    slowest motion).
+
+    Within a state, what is left is remembered for a short while: blocks are many, and so is what they can tell.
+    """
+    if _are_many(inputs):
+        return left_out("φ given ψ's basin", f"{len(inputs.torsions.residues)} residues share their rows")
+    rows: list[Row | None] = []
+    turning = slow_torsions(inputs.reference.features)
+    if inputs.torsions.residues:
+        for residue in inputs.torsions.residues:
+            metric = f"φ given ψ's basin, distance, {residue.label}"
+            what = f"φ of {residue.label} within the basins of ψ is distributed"
+            phi, states = _angle(inputs, "phi", residue.phi), _basins(inputs, residue)
+            rows.append(_conditional_row(inputs, [phi], states, f"phi_given_psi:{residue.label}", metric, what))
+    elif len(turning) > 1:
+        chosen = turning[:_MOST_TORSIONS]
+        metric = f"{len(chosen)} rotatable torsions given the slowest motion, mean distance"
+        what = "rotatable torsions within states of the slowest motion are distributed"
+        angles = [[[x[:, k] for x in v] for v in inputs.families("torsions")] for k in chosen]
+        rows.append(_conditional_row(inputs, angles, slow_states(inputs), "torsions_given_slowest", metric, what))
+    skipped = [("Torsions within the states of slower ones", "the three trajectories share none of them")]
+    return Measured([row for row in rows if row is not None], skipped=skipped if None in rows else [])
+
+
+def _basins(inputs: ComparisonInput, residue: Residue) -> States:
+    """The two basins of psi with phi < 0, and what else there is: a third state that is slow in itself, left out."""
+    return [
+        [
+            np.where(distributions.is_positive(f), -1, distributions.is_alpha(p).astype(np.int64))
+            for f, p in zip(phi, psi, strict=True)
+        ]
+        for phi, psi in zip(_angle(inputs, "phi", residue.phi), _angle(inputs, "psi", residue.psi), strict=True)
+    ]
+
+
+def _conditional_row(
+    inputs: ComparisonInput, angles: Sequence[Three], states: States, key: str, metric: str, what: str
+) -> Row | None:
+    """Return the row of angles within states. None where no state holds one frame in twenty of each of the three, of
+    all of it and of the equal length."""
+    n = min(s.features.n_frames for s in inputs.samples)
+    flat = [np.concatenate(list(s)) + 1 for s in states]
+    shares = [np.bincount(x, minlength=2) / len(x) for whole in flat for x in (whole, whole[:n])]
+    n_states = min(map(len, shares)) - 1
+    kept = [k for k in range(n_states) if min(share[k + 1] for share in shares) >= _LEAST_SHARE]
+    if not kept:
+        return None
+    cosines = [[[np.cos(x.astype(np.float64)) for x in v] for v in three] for three in angles]
+    fine = [with_own_blocks(inputs, residuals(three, states)) for three in cosines]
+    chosen = max(fine, key=lambda x: x.reference.blocks.n_frames_each)
+    counts, strata = [], []
+    for which, sample in enumerate(chosen.samples):
+        masked = [
+            [np.where(s == k, x, np.nan) for x, s in zip(three[which], states[which], strict=True)]
+            for three in angles
+            for k in kept
+        ]
+        each = [distributions.block_counts(x, TORSION_BINS, sample.blocks)[:, : TORSION_BINS.n] for x in masked]
+        counts.append(np.stack(each, axis=1))
+        # The state that most frames of a block are in.
+        most = int(max(int(s.max(initial=0)) for s in states[which])) + 2
+        of_block = distributions.count_in_blocks([s + 1 for s in states[which]], most, sample.blocks)
+        strata.append(np.asarray(of_block.argmax(axis=1), dtype=np.int64))
+    return distance_row(chosen, counts, key, "distributions", metric, what, strata)
+
+
+def step_rows(inputs: ComparisonInput) -> Measured:
+    """Return the row of the step of all torsions from frame to frame: its root mean square, as if every trajectory were
+    in the states of the slowest motion as often as the reference. A wrong time between frames shows here first.
+
+    Only states that all three hold count: what one run alone has met, and steps in otherwise, is no wrong time.
+    """
+    if not (len(inputs.torsions.phi) or len(inputs.torsions.psi) or slow_torsions(inputs.reference.features)):
+        return left_out("Steps of torsions from frame to frame", "the scene has no torsion to turn about")
+    squared = [[_squared_steps(x) for x in _angles(s.features)] for s in inputs.samples]
+    states = [
+        [np.where((x >= 0) & (y >= 0), _N_STATES * x + y, -1) for x, y in zip(own, apart, strict=True)]
+        for own, apart in zip(slow_states(inputs), _states_apart(inputs), strict=True)
+    ]
+    fine = with_own_blocks(inputs, residuals(squared, states))
+    flat = [np.concatenate(list(own)) for own in states]
+    n_states = max(int(x.max(initial=0)) for x in flat) + 1
+    frames = [np.bincount(x[x >= 0], minlength=n_states) for x in flat]
+    shared = np.all([n >= _LEAST_IN_STATE * max(int(n.sum()), 1) for n in frames], axis=0)
+    share = np.asarray(frames[0] + frames[2], dtype=np.float64)
+    if shared.any():
+        share[~shared] = 0.0
+    values, draws = [], []
+    for sample, steps, of in zip(fine.samples, squared, states, strict=True):
+        total, count = np.zeros((2, sample.blocks.n_blocks, n_states))
+        for piece in sample.blocks.pieces:
+            part, state = (x[piece.segment][piece.start : piece.stop] for x in (steps, of))
+            ok = np.isfinite(part) & (state >= 0)
+            total[piece.block] += np.bincount(state[ok], weights=part[ok], minlength=n_states)
+            count[piece.block] += np.bincount(state[ok], minlength=n_states)
+        values.append(float(_standardised(total.sum(0), count.sum(0), share)))
+        draws.append(_standardised(sample.weights @ total, sample.weights @ count, share))
+    name = f"Step of all torsions from frame to frame ({format_time_ps(inputs.lag_ps)}), root mean square"
+    metric = Quantity("torsion_step", "kinetics", name, "°", 0.05, relative=True)
+    return Measured([observable_row(fine, metric, values, draws, _step_words)])
+
+
+def _angles(features: Features) -> list[AnyFloat]:
+    """Return phi, psi and every other rotatable torsion `(n, k)` per segment."""
+    slow = slow_torsions(features)
+    further = [x[:, slow] for x in features.series["torsions"]] if features.series else [x[:, :0] for x in features.phi]
+    return [np.concatenate(x, axis=1) for x in zip(features.phi, features.psi, further, strict=True)]
+
+
+def squared_turn(angles_rad: AnyFloat) -> FloatArray:
+    """Return the mean square step in rad² of angles `(n, k)` from frame to frame, `(n - 1,)`."""
+    step = np.diff(angles_rad.astype(np.float64), axis=0)
+    return np.asarray(((step - 2 * np.pi * np.round(step / (2 * np.pi))) ** 2).mean(axis=1))
+
+
+def _squared_steps(angles_rad: AnyFloat) -> FloatArray:
+    """Return the same with NaN after the last frame, `(n,)`."""
+    return np.append(squared_turn(angles_rad), np.nan)[: len(angles_rad)]
+
+
+def _step_words(c: float, r: float) -> str:
+    """Return what the steps are, and what may be the cause; the row cannot tell these apart."""
+    words = f"torsions step by {c:.3g}° from frame to frame instead of {r:.3g}°"
+    if not math.isfinite(c) or c == r:
+        return words
+    if c > r:
+        return (
+            f"{words}; possible causes: frames further apart in time than said, a higher temperature, less friction, "
+            "another force field or solvent, or a model that moves too far in a step"
+        )
+    return (
+        f"{words}; possible causes: frames closer in time than said, a lower temperature, more friction, another force "
+        "field or solvent, smoothed frames, or a model that moves too little in a step"
+    )
+
+
+def _standardised(total: FloatArray, count: FloatArray, share: FloatArray) -> FloatArray:
+    """Return the root in degrees of the means over states `(..., n_states)`, weighted by the reference's
+    populations."""
+    with np.errstate(invalid="ignore", divide="ignore"):
+        means = total / count
+        weight = np.where(count > 0, share, 0.0)
+        return np.asarray(np.degrees(np.sqrt((np.nan_to_num(means) * weight).sum(-1) / weight.sum(-1))))
+
+
+def with_own_blocks(inputs: ComparisonInput, series: Three) -> ComparisonInput:
+    """Return the comparison in blocks that are long enough for `series`, the slowest motion's at most.
+
+    The least length of ten correlation times of the series, doubled until no longer one gives means that vary more than
+    its own say (Flyvbjerg and Petersen, J. Chem. Phys. 91, 461, 1989): a weak slow part makes the blocks long again.
+    """
+    longest = inputs.reference.blocks.n_frames_each
+    n = min(s.features.n_frames for s in inputs.samples)
+    times = [kinetics.zero_crossing([x - np.nanmean(np.concatenate(s)) for x in s])[1] for s in series]
+    slowest = max((t for t in times if math.isfinite(t)), default=1.0)
+    each = min(max(math.ceil(BLOCK_IN_CORRELATION_TIMES * slowest), -(-n // MAX_BLOCKS)), longest)
+    lengths = [each]
+    while 2 * lengths[-1] <= longest:
+        lengths.append(2 * lengths[-1])
+    spread = [_variance_of_mean(series, length) for length in lengths]
+    for k, length in enumerate(lengths):
+        beyond = [(v, 1.0 + 2.0 * math.sqrt(2.0 / max(degrees, 1))) for v, degrees in spread[k + 1 :]]
+        if all(v <= doubt * spread[k][0] for v, doubt in beyond):
+            each = length
+            break
+    made = [
+        make_sample(s.features, make_blocks(s.features.segment_lengths, each), inputs.options, _STREAM + k, n)
+        for k, s in enumerate(inputs.samples)
+    ]
+    return replace(inputs, reference=made[0], candidate=made[1], replicate=made[2])
+
+
+def _variance_of_mean(series: Three, length: int) -> tuple[float, int]:
+    """Return the variance of means over blocks times their length, of all three, and its degrees of freedom."""
+    total, freedom = 0.0, 0
+    for segments in series:
+        cut = [np.nan_to_num(x[: len(x) // length * length]).reshape(-1, length).mean(axis=1) for x in segments]
+        every = np.concatenate(cut)
+        if len(every) > 1:
+            total += float(((every - every.mean()) ** 2).sum())
+            freedom += len(every) - 1
+    return (length * total / freedom if freedom else 0.0), freedom
+
+
+def slow_states(inputs: ComparisonInput) -> States:
+    """Return the quarter of the reference's slowest motion (TIC 0) that each frame of each sample lies in, `(n,)` per
+    segment: quarters hold equally many of its frames. All 0 where nothing turns or frames are too few for TICA, -1 for
+    frames that are not finite."""
+    features = [tica_features(s.features) for s in inputs.samples]
+    between = np.arange(1, _N_STATES) / _N_STATES
+    return _in_quarters(inputs, features, [*features[0], *features[2]], lambda x: np.quantile(x, between))
+
+
+def _states_apart(inputs: ComparisonInput) -> States:
+    """Return the same of the slowest motion of all three, its quarters equally wide: a state far from all others, which
+    one run may visit once for long and another never, is a quarter of its own."""
+    features = [tica_features(s.features) for s in inputs.samples]
+
+    def edges(values: FloatArray) -> FloatArray:
+        low, high = np.quantile(values, _WITHOUT_STRAYS)
+        return np.asarray(np.linspace(low, high, _N_STATES + 1)[1:-1])
+
+    return _in_quarters(inputs, features, [x for own in features for x in own], edges)
+
+
+def _in_quarters(
+    inputs: ComparisonInput,
+    features: Three,
+    fitted: Segments,
+    edges: Callable[[FloatArray], FloatArray],
+) -> States:
+    """Fit TICA to `fitted`, and put every frame of `features` between the `edges` of its values there."""
+    lag = max(1, round(_TICA_LAG_PS / inputs.lag_ps))
+    model = kinetics.fit_tica(fitted, lag) if max(map(len, fitted)) > 10 * lag else None
+    if model is None:
+        return [[np.zeros(n, dtype=np.int64) for n in s.features.segment_lengths] for s in inputs.samples]
+    values = np.concatenate([model.project(x) for x in fitted])
+    between = edges(values[np.isfinite(values)])
+    projected = [[model.project(x) for x in own] for own in features]
+    return [
+        [np.where(np.isfinite(p), np.searchsorted(between, p), -1).astype(np.int64) for p in own] for own in projected
+    ]
+
+
+def residuals(values: Three, states: States) -> list[list[FloatArray]]:
+    """Return each value less its sample's mean over the frames of the same state; 0 where it is not finite."""
+    out = []
+    for own, of in zip(values, states, strict=True):
+        flat, where = np.concatenate(list(own)), np.concatenate(list(of))
+        rest = np.zeros(len(flat))
+        for state in np.unique(where):
+            inside: BoolArray = (where == state) & np.isfinite(flat)
+            if inside.any():
+                rest[inside] = flat[inside] - flat[inside].mean()
+        out.append(np.split(rest, np.cumsum([len(x) for x in own])[:-1]))
+    return out

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from surrogate.comparison.input_notes import LEAST_SAMPLES
+from surrogate.comparison.verdict import LEAST_SAMPLES
 from surrogate.verbs.run.decision import Way
 from surrogate.verbs.run.run_record import Outcome
 from systems.units import format_time_ps, format_wall

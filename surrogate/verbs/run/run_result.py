@@ -64,7 +64,7 @@ class RunResult(dict[str, Any]):
     def plot(self) -> Figure:
         """Return a matplotlib figure of the populations of all states by MD, with their errors, beside the
         surrogate's, and of the first residues' free energies over φ and ψ."""
-        from surrogate.comparison.report.overview import answer_overview
+        from surrogate.comparison.report.figures import answer_overview
 
         return answer_overview(self["molecule"], self.answer)
 

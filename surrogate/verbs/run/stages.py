@@ -314,7 +314,7 @@ def answer_of(site: Site, record: RunRecord) -> Answer | None:
 
 
 def _report(site: Site, record: RunRecord) -> RunRecord:
-    from surrogate.comparison.report.overview import weighted_maps
+    from surrogate.comparison.report.figures import weighted_maps
     from surrogate.comparison.report.report import Foreword, write_report
 
     rates, decision = _rates_and_decision(record)

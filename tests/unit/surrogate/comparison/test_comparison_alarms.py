@@ -19,7 +19,7 @@ from compare_alarms import (
 
 from surrogate.comparison.measure.statistics import Estimate
 from surrogate.comparison.read.ensemble import Ensemble
-from surrogate.comparison.rows import relaxation_rows
+from surrogate.comparison.rows import kinetics_rows
 from systems.errors import InputError
 
 
@@ -55,13 +55,13 @@ def test_intervals_of_relaxation_times_are_counted(runs: list[Ensemble], monkeyp
     found = count_intervals(runs, 350.0)
     assert found.n == 6 and found.n_held >= 5 and list(found.times_ps) == ["ALA 2"]
     assert "of 6 intervals hold" in report_intervals(found)
-    made = relaxation_rows.estimate
+    made = kinetics_rows.estimate
 
     def narrow(value: float, draws: np.ndarray, n_blocks: int, *, log: bool = False) -> Estimate:
         whole = made(value, draws, n_blocks, log=log)
         return replace(whole, low=value - 0.1 * (value - whole.low), high=value + 0.1 * (whole.high - value))
 
-    monkeypatch.setattr(relaxation_rows, "estimate", narrow)
+    monkeypatch.setattr(kinetics_rows, "estimate", narrow)
     assert count_intervals(runs, 350.0).n_held < found.n_held
 
 

@@ -9,7 +9,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from surrogate.comparison import equivalent_time_measures
 from surrogate.comparison.comparison import Evaluation, Summary, compare, cost_ratio
 from surrogate.comparison.equivalent_time import (
     EquivalentTime,
@@ -17,6 +16,7 @@ from surrogate.comparison.equivalent_time import (
     distance_to_reference,
     equivalent_time_by,
     errors_by_length,
+    even_blocks,
     headline,
 )
 from surrogate.comparison.measure import distributions
@@ -117,7 +117,7 @@ def test_parts_of_a_candidate_err_as_md_of_their_length_does_and_a_bias_stays() 
 
 def test_even_blocks_cover_every_frame_once() -> None:
     for lengths in ([1000], [300, 7, 693], [128] * 5):
-        blocks = equivalent_time_measures.even_blocks(lengths, 16)
+        blocks = even_blocks(lengths, 16)
         seen = [np.zeros(n, dtype=int) for n in lengths]
         sizes = np.zeros(16, dtype=int)
         for piece in blocks.pieces:

@@ -45,7 +45,18 @@ def wrong_row(inputs: ComparisonInput) -> Measured:
     x = inputs.reference.weights[0][:2]
     bad, good = Estimate(9.0, 8.9, 9.1, 0.05), Estimate(1.0, 0.9, 1.1, 0.05)
     row = Row(
-        "made_up", "structure", "Made up", "", "observable", good, bad, good, None, 1e-9, 0.5, 0.1, "", "it is off"
+        key="made_up",
+        group="structure",
+        metric="Made up",
+        form="observable",
+        reference=good,
+        candidate=bad,
+        replicate=good,
+        p_value=1e-9,
+        p_replicate=0.5,
+        tolerance=0.1,
+        tolerance_text="",
+        statement="it is off",
     )
     return Measured([row], [LineChart("structure", "Made up", "", "x", "y", (Line("a", "other", x, x),))])
 

@@ -12,7 +12,7 @@ import pytest
 from surrogate.comparison.comparison import Evaluation, compare
 from surrogate.comparison.measure.statistics import Estimate
 from surrogate.comparison.read.ensemble import Ensemble, load_ensemble, time_axis
-from surrogate.comparison.report.wording import interval, number
+from surrogate.comparison.report.report import interval, number
 from surrogate.comparison.rows.rows import Options
 from systems.errors import InputError
 from systems.scene import Scene

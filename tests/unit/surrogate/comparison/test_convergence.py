@@ -105,14 +105,14 @@ def test_a_state_that_the_reference_could_not_have_met_is_undecided_and_one_it_m
 def test_wells_are_peaks_that_a_minimum_parts() -> None:
     rng = np.random.default_rng(1)
     two = np.concatenate([rng.normal(-1.0, 0.2, 900), rng.normal(2.5, 0.2, 100)])
-    found = find_wells("ψ", [two])
+    found = find_wells([two])
     assert len(found.names) == 2
     assert np.mean(found.assign([two])[0] == found.assign([np.array([2.5])])[0][0]) == pytest.approx(0.1, abs=0.01)
-    assert len(find_wells("ψ", [rng.normal(3.1, 0.4, 500)]).names) == 1
+    assert len(find_wells([rng.normal(3.1, 0.4, 500)]).names) == 1
     gone = np.array([2.5, np.nan, 2.5])
     assert found.labels([gone])[0][1] == -1 and found.assign([gone])[0][1] >= 0
     three = np.concatenate([rng.normal(np.radians(c), 0.2, 500) for c in (-60.0, 60.0, 178.0)])
-    assert len(find_wells("χ1", [np.arctan2(np.sin(three), np.cos(three))]).names) == 3
+    assert len(find_wells([np.arctan2(np.sin(three), np.cos(three))]).names) == 3
 
 
 def test_real_runs_of_alanine_dipeptide_pass_and_their_beginnings_do_not(shared_data: Path) -> None:

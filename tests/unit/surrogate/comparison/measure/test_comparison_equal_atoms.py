@@ -7,13 +7,11 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from surrogate.comparison.measure.probes import MAX_COLUMNS, _foremost
 from surrogate.comparison.measure.statistics import make_blocks
-from surrogate.comparison.measure.structure import Baseline
+from surrogate.comparison.measure.structure import MAX_COLUMNS, Baseline, _foremost
 from surrogate.comparison.read.ensemble import Ensemble
-from surrogate.comparison.rows.bond_rows import angle_rows
 from surrogate.comparison.rows.rows import ComparisonInput, Options, Row, make_sample
-from surrogate.comparison.rows.shape_rows import contact_rows, hydrogen_bond_rows, shape_rows
+from surrogate.comparison.rows.structure_rows import angle_rows, contact_rows, hydrogen_bond_rows, shape_rows
 from systems.library.named_scenes import prepare
 from systems.scene import Scene
 

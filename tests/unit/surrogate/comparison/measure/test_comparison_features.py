@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from surrogate.comparison.measure.probes import find_probes, find_rings, mean_structure, pucker
+from surrogate.comparison.measure.structure import find_probes, find_rings, mean_structure, pucker
 from surrogate.comparison.measure.torsions import find_torsions
 from surrogate.comparison.read.ensemble import Ensemble, load_ensemble
 from systems.chemistry.graph import bonded_graph

@@ -12,17 +12,17 @@ import pytest
 from compare_speed import noisy_path
 
 from surrogate.comparison.comparison import compare
-from surrogate.comparison.measure import kinetics, msm
-from surrogate.comparison.measure.probes import evenly
+from surrogate.comparison.measure import kinetics
+from surrogate.comparison.measure.structure import evenly
 from surrogate.comparison.read.ensemble import Ensemble, load_ensemble
-from surrogate.comparison.rows.relaxation_rows import speed_words
+from surrogate.comparison.rows.kinetics_rows import speed_words
 from surrogate.comparison.rows.rows import Options
 
 
 def test_more_torsions_than_frames_have_no_slowest_combination() -> None:
     rng = np.random.default_rng(0)
     few, many = rng.standard_normal((90, 50)), rng.standard_normal((90, 40))
-    assert kinetics.fit_tica([few], 1) is None and msm.fit_projection([few], 1) is None
+    assert kinetics.fit_tica([few], 1) is None and kinetics.fit_projection([few], 1) is None
     assert kinetics.fit_tica([many], 1) is not None, "negative control"
     assert kinetics.fit_tica([np.empty((90, 0))], 1) is None
 
@@ -33,28 +33,28 @@ def test_states_that_cannot_be_lumped_give_no_model(monkeypatch: pytest.MonkeyPa
 
     rng = np.random.default_rng(1)
     three = [np.cumsum(rng.standard_normal((2_000, 3)), axis=0) % 7.0 for _ in range(2)]
-    projection = msm.fit_projection(three, 1)
+    projection = kinetics.fit_projection(three, 1)
     assert projection is not None
     coordinates = [projection.project(x) for x in three]
-    assert msm.fit_model(projection, coordinates, 1) is not None, "negative control"
+    assert kinetics.fit_model(coordinates, 1) is not None, "negative control"
     for error in (RuntimeError, ValueError, np.linalg.LinAlgError):
 
         def fail(self: MarkovStateModel, n: int, error: type[Exception] = error) -> None:
             raise error("no simplex")
 
         monkeypatch.setattr(MarkovStateModel, "pcca", fail)
-        assert msm.fit_model(projection, coordinates, 1) is None
+        assert kinetics.fit_model(coordinates, 1) is None
 
 
 def test_states_without_a_way_back_give_no_model() -> None:
     """Frames that walk through six places once each: no two are connected both ways, and nothing is lumped."""
     rng = np.random.default_rng(1)
     places = np.repeat(10.0 * rng.standard_normal((6, 3)), 60, axis=0) + 1e-3 * rng.standard_normal((360, 3))
-    projection = msm.fit_projection([places], 1)
+    projection = kinetics.fit_projection([places], 1)
     assert projection is not None
-    assert msm.fit_model(projection, [projection.project(places)], 1, n_micro=6) is None
+    assert kinetics.fit_model([projection.project(places)], 1, n_micro=6) is None
     there_and_back = [places, places[::-1].copy()]
-    assert msm.fit_model(projection, [projection.project(x) for x in there_and_back], 1, n_micro=6) is not None
+    assert kinetics.fit_model([projection.project(x) for x in there_and_back], 1, n_micro=6) is not None
 
 
 def test_a_comparison_whose_states_cannot_be_lumped_names_what_is_left_out(
@@ -79,9 +79,9 @@ def test_a_comparison_whose_states_cannot_be_lumped_names_what_is_left_out(
 
 
 def test_words_for_what_takes_no_time() -> None:
-    assert speed_words("x relaxes", 3.0, 0.0) == "x relaxes in 3 ps, the reference within one frame"
-    assert "within one frame" in speed_words("x relaxes", 0.0, 3.0)
-    assert "does not move" in speed_words("x relaxes", math.nan, 3.0)
+    assert speed_words("x relaxes")(3.0, 0.0) == "x relaxes in 3 ps, the reference within one frame"
+    assert "within one frame" in speed_words("x relaxes")(0.0, 3.0)
+    assert "does not move" in speed_words("x relaxes")(math.nan, 3.0)
 
 
 def test_evenly_chosen_items_cover_the_whole() -> None:

@@ -12,7 +12,7 @@ import numpy.typing as npt
 import pytest
 
 from surrogate.comparison.comparison import compare
-from surrogate.comparison.measure.probes import COIL, HELIX, STRAND, find_chains, secondary_structure
+from surrogate.comparison.measure.structure import COIL, HELIX, STRAND, find_chains, secondary_structure
 from surrogate.comparison.read.ensemble import Ensemble
 from surrogate.comparison.rows.rows import Options
 from systems.scene import Scene

@@ -14,9 +14,8 @@ from surrogate.comparison.comparison import compare
 from surrogate.comparison.measure import distributions
 from surrogate.comparison.measure.statistics import Blocks
 from surrogate.comparison.measure.structure import Baseline, backbone
-from surrogate.comparison.read.common_atoms import match_scenes, solute_atoms
 from surrogate.comparison.read.ensemble import Ensemble, alike, load_ensemble
-from surrogate.comparison.read.stored_frames import StoredFrames, bond_tree, make_whole
+from surrogate.comparison.read.stored_frames import StoredFrames, bond_tree, make_whole, match_scenes, solute_atoms
 from surrogate.comparison.rows.rows import Options
 from systems.errors import InputError, OutOfDomainError
 from systems.library.named_scenes import prepare

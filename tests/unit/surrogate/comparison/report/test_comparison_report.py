@@ -17,10 +17,9 @@ import pytest
 from surrogate.comparison.comparison import Comparison, compare
 from surrogate.comparison.measure.statistics import Estimate
 from surrogate.comparison.read.ensemble import Ensemble
-from surrogate.comparison.report import report, wording
+from surrogate.comparison.report import report
 from surrogate.comparison.report.figures import Album, Figure, albums
-from surrogate.comparison.report.report import Foreword, to_markdown, write_report
-from surrogate.comparison.report.wording import side_by_side
+from surrogate.comparison.report.report import Foreword, side_by_side, to_markdown, write_report
 from surrogate.comparison.rows.charts import BarChart, Landscape, Line, LineChart
 from systems.errors import InputError, StorageError
 
@@ -186,8 +185,8 @@ def test_markdown_has_the_verdicts_every_row_and_no_markup_from_outside(comparis
     cells = [line.split(" | ") for line in text.splitlines() if line.startswith("| ")]
     for evaluation in comparison.evaluations:
         for row in evaluation.rows:
-            shown = f"{wording.number(row.candidate)} {wording.interval(row.candidate)}".strip()
-            assert any(shown in line and any(f"{wording.MARKS[row.verdict]} {row.verdict}" in c for c in line)
+            shown = f"{report.number(row.candidate)} {report.interval(row.candidate)}".strip()
+            assert any(shown in line and any(f"{report.MARKS[row.verdict]} {row.verdict}" in c for c in line)
                        for line in cells), row.key  # fmt: skip
     assert all(len(line) == len(cells[k - 1]) or cells[k - 1][0] != line[0] for k, line in enumerate(cells) if k > 1)
     assert "surromd compare a b" in text
@@ -251,16 +250,16 @@ def test_a_full_disk_leaves_the_old_report_alone(
 
 
 def test_numbers_show_as_many_digits_as_they_have() -> None:
-    assert wording.number(Estimate(0.12345, error=0.02)) == "0.123"
-    assert wording.number(Estimate(123.456, error=20.0)) == "123"
-    assert wording.number(Estimate(99.9871, error=0.002)) == "99.987"
-    assert wording.number(Estimate(float("nan"))) == "not defined"
-    assert wording.number(None) == "–"
-    assert wording.interval(Estimate(1.0, 0.9, 1.1, 0.05)) == "[0.900, 1.100]"
-    assert wording.interval(Estimate(1.0, 1.0, 1.0, 0.0)) == ""
-    assert wording.setting("temperature_k", 300.0) == "temperature 300 K"
-    assert wording.setting("friction_per_ps", 1.0) == "friction 1 /ps"
-    assert wording.setting("force_field", "ff14SB") == "force field ff14SB"
+    assert report.number(Estimate(0.12345, error=0.02)) == "0.123"
+    assert report.number(Estimate(123.456, error=20.0)) == "123"
+    assert report.number(Estimate(99.9871, error=0.002)) == "99.987"
+    assert report.number(Estimate(float("nan"))) == "not defined"
+    assert report.number(None) == "–"
+    assert report.interval(Estimate(1.0, 0.9, 1.1, 0.05)) == "[0.900, 1.100]"
+    assert report.interval(Estimate(1.0, 1.0, 1.0, 0.0)) == ""
+    assert report.setting("temperature_k", 300.0) == "temperature 300 K"
+    assert report.setting("friction_per_ps", 1.0) == "friction 1 /ps"
+    assert report.setting("force_field", "ff14SB") == "force field ff14SB"
 
 
 def test_a_scene_without_torsions_still_has_a_page(tmp_path: Path) -> None:

@@ -8,7 +8,7 @@ import numpy as np
 
 from surrogate.comparison.comparison import compare
 from surrogate.comparison.read.ensemble import Ensemble
-from surrogate.comparison.report.overview import answer_overview, weighted_maps
+from surrogate.comparison.report.figures import answer_overview, weighted_maps
 
 
 def test_a_comparison_draws_reference_replicate_and_candidates(inputs: tuple[Ensemble, Ensemble, Ensemble]) -> None:

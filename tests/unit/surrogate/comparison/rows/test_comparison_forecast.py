@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from surrogate.comparison.comparison import compare
 from surrogate.comparison.read.ensemble import Ensemble
 from surrogate.comparison.rows.charts import LineChart
-from surrogate.comparison.rows.forecast import find_pairs, forecast_charts, forecasts
+from surrogate.comparison.rows.published_metrics import find_pairs, forecast_charts, forecasts
 from surrogate.comparison.rows.rows import Options
 from systems.scene import Scene
 

@@ -16,7 +16,7 @@ from surrogate.comparison.comparison import Evaluation, compare
 from surrogate.comparison.measure import structure
 from surrogate.comparison.measure.structure import Features
 from surrogate.comparison.read.ensemble import Ensemble, load_ensemble
-from surrogate.comparison.rows import peptide_protocol
+from surrogate.comparison.rows import published_metrics
 from surrogate.comparison.rows.rows import Options
 from systems.scene import Scene
 
@@ -39,9 +39,9 @@ def test_the_table_equals_scipy_and_deeptime(real: tuple[Features, Features]) ->
     from deeptime.decomposition import TICA
 
     reference, other = real
-    fit = peptide_protocol.fit_recipe(reference)
+    fit = published_metrics.fit_recipe(reference)
     assert fit is not None and fit.model is not None
-    table = peptide_protocol.peptide_table(fit, reference, other)
+    table = published_metrics.peptide_table(fit, reference, other)
 
     def column(features: Features, name: str) -> np.ndarray:
         return np.concatenate([x[:, 0] for x in getattr(features, name)]).astype(float)
@@ -70,14 +70,14 @@ def test_the_table_equals_scipy_and_deeptime(real: tuple[Features, Features]) ->
 
 def test_a_trajectory_has_no_distance_to_itself(real: tuple[Features, Features]) -> None:
     reference, other = real
-    fit = peptide_protocol.fit_recipe(reference)
+    fit = published_metrics.fit_recipe(reference)
     assert fit is not None
-    assert np.nan_to_num(peptide_protocol.peptide_table(fit, reference, reference).values()) == pytest.approx(
+    assert np.nan_to_num(published_metrics.peptide_table(fit, reference, reference).values()) == pytest.approx(
         np.zeros(6), abs=1e-7
     )
     shifted = Features(**{**vars(other), "psi": [x + np.float32(0.5) for x in other.psi]})
-    wrong = peptide_protocol.peptide_table(fit, reference, shifted)
-    right = peptide_protocol.peptide_table(fit, reference, other)
+    wrong = published_metrics.peptide_table(fit, reference, shifted)
+    right = published_metrics.peptide_table(fit, reference, other)
     assert (wrong.values()[[0, 2, 3, 4]] > 1.5 * right.values()[[0, 2, 3, 4]]).all(), "negative control"
 
 
@@ -85,9 +85,9 @@ def test_candidates_of_one_length_share_what_is_fitted_on_the_reference(
     simulate: Callable[..., Ensemble], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     made: list[int] = []
-    fit_recipe = peptide_protocol.fit_recipe
+    fit_recipe = published_metrics.fit_recipe
 
-    def counted(reference: Features) -> peptide_protocol.Fit | None:
+    def counted(reference: Features) -> published_metrics.Fit | None:
         made.append(reference.n_frames)
         return fit_recipe(reference, n_clusters=12, n_states=3)
 
@@ -95,7 +95,7 @@ def test_candidates_of_one_length_share_what_is_fitted_on_the_reference(
         (bars,) = (c for c in evaluation.charts if getattr(c, "title", "") == "By the peptide papers' recipe")
         return list(bars.to_dict()["candidate"])
 
-    monkeypatch.setattr(peptide_protocol, "fit_recipe", counted)
+    monkeypatch.setattr(published_metrics, "fit_recipe", counted)
     quick = Options(n_bootstrap=30, n_permutations=20)
     reference, one, other, replicate = (simulate(80 + k, 1200) for k in range(4))
     shorter = replace(other, segments=[other.segments[0][:1100]])
@@ -111,8 +111,8 @@ def test_decorrelation_of_a_torsion_that_diffuses_about_a_mean() -> None:
     a, s = 0.95, 0.7
     kicks = rng.standard_normal((2, 200_000)) * math.sqrt(1 - a * a)
     angles = [1.0 + s * x for x in lfilter([1.0], [1.0, -a], kicks, axis=1)]
-    found = peptide_protocol.decorrelation(angles, 60)
+    found = published_metrics.decorrelation(angles, 60)
     exact = (np.exp(s**2 * a ** np.arange(60.0)) - 1) / (np.exp(s**2) - 1)
     assert found[0] == pytest.approx(1.0)
     assert found == pytest.approx(exact, abs=0.02)
-    assert np.isnan(peptide_protocol.decorrelation([np.full(100, 0.3)], 5)).all()
+    assert np.isnan(published_metrics.decorrelation([np.full(100, 0.3)], 5)).all()

@@ -9,7 +9,7 @@ import pytest
 
 from surrogate.comparison.comparison import Evaluation, compare
 from surrogate.comparison.equivalent_time import EquivalentTime, equivalent_time_charts
-from surrogate.comparison.measure.probes import _ends
+from surrogate.comparison.measure.structure import _ends
 from surrogate.comparison.read.ensemble import Ensemble
 from surrogate.comparison.rows.charts import LineChart
 from surrogate.comparison.rows.rows import Options

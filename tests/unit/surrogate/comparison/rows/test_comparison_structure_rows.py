@@ -11,9 +11,8 @@ import pytest
 from surrogate.comparison.measure.statistics import make_blocks
 from surrogate.comparison.measure.structure import Baseline, Features, backbone
 from surrogate.comparison.read.ensemble import Ensemble
-from surrogate.comparison.rows.bond_rows import angle_rows
 from surrogate.comparison.rows.rows import ComparisonInput, Options, Row, make_sample
-from surrogate.comparison.rows.shape_rows import contact_rows, hydrogen_bond_rows, shape_rows
+from surrogate.comparison.rows.structure_rows import angle_rows, contact_rows, hydrogen_bond_rows, shape_rows
 from surrogate.comparison.rows.torsion_rows import other_torsion_rows
 from surrogate.comparison.verdict import evaluated_rows
 from systems.chemistry.graph import backbone_torsions, bonded_graph

@@ -22,7 +22,7 @@ from surrogate.comparison.measure.statistics import (
 )
 from surrogate.comparison.measure.structure import Features
 from surrogate.comparison.read.ensemble import Ensemble, load_ensemble
-from surrogate.comparison.rows import relaxation_rows
+from surrogate.comparison.rows import kinetics_rows
 from surrogate.comparison.rows.rows import Options
 from systems.scene import Scene
 
@@ -88,7 +88,7 @@ def _within(reference: Ensemble, measured: list[Features], candidate: Features) 
     from surrogate.comparison import comparison, verdict
     from surrogate.comparison.convergence import convergence_of
     from surrogate.comparison.measure import structure
-    from surrogate.comparison.rows.within_rows import within_rows
+    from surrogate.comparison.rows.torsion_rows import within_rows
 
     baseline = structure.Baseline.of(reference, probing=False)
     summary = summary_of(reference)
@@ -137,7 +137,7 @@ def test_a_state_that_one_run_alone_has_met_is_no_wrong_time(
     """Steps are larger there, in the reference, the candidate or the replicate; every second frame is still seen."""
     from surrogate.comparison import verdict
     from surrogate.comparison.measure.structure import backbone
-    from surrogate.comparison.rows import within_rows
+    from surrogate.comparison.rows import torsion_rows
     from surrogate.comparison.rows.rows import ComparisonInput, make_sample
 
     def word(candidate: Features) -> str:
@@ -146,14 +146,14 @@ def test_a_state_that_one_run_alone_has_met_is_no_wrong_time(
         samples = [make_sample(f, blocks, OPTIONS, k, 10_000) for k, f in enumerate(three)]
         torsions = backbone(alanine_dipeptide)
         inputs = ComparisonInput(alanine_dipeptide, torsions, None, *samples, OPTIONS)  # type: ignore[arg-type]
-        evaluated = verdict.evaluated_rows(within_rows.step_rows(inputs).rows, OPTIONS)
+        evaluated = verdict.evaluated_rows(torsion_rows.step_rows(inputs).rows, OPTIONS)
         return next(r.verdict for r in evaluated if r.key == "torsion_step")
 
     assert word(hopping(2, far=visitor == 1)) == "agrees"
     assert word(hopping(2, far=visitor == 1, stride=2)) == "differs"
     if visitor == 1:
         together = [[np.zeros(10_000, dtype=np.int64)] for _ in range(3)]
-        monkeypatch.setattr(within_rows, "states_apart", lambda inputs: together)
+        monkeypatch.setattr(torsion_rows, "_states_apart", lambda inputs: together)
         assert word(hopping(2, far=True)) == "differs", "negative control: the far state not told apart"
 
 
@@ -165,7 +165,8 @@ def test_within_states_few_samples_blame_nobody_where_the_replicate_differs_too(
 
     def row(time_scale: TimeScale, p_replicate: float) -> Row:
         one = Estimate(1.0, 0.9, 1.1, 0.05)
-        return Row("x", "kinetics", "x", "", "observable", one, one, one, None, 1e-6, p_replicate, 0.2, "", "",
+        return Row(key="x", group="kinetics", metric="x", form="observable", reference=one, candidate=one,
+                   replicate=one, p_value=1e-6, p_replicate=p_replicate, tolerance=0.2, tolerance_text="", statement="",
                    time_scale=time_scale)  # fmt: skip
 
     rows = [row("step", 0.5), row("step", 1e-5), row("within states", 0.5), row("within states", 1e-5),
@@ -250,7 +251,7 @@ def test_intervals_of_relaxation_times_hold_what_they_say() -> None:
         weights = bootstrap_weights(blocks.n_blocks, 200, rng)
         sums = kinetics.lag_sums(series, blocks, 3 * crossing + 2)
         draws = kinetics.correlation_time(kinetics.autocorrelation(sums, weights))
-        wide = relaxation_rows._widened(draws, blocks.n_blocks, crossing, series)
+        wide = kinetics_rows._widened(draws, blocks.n_blocks, crossing, series)
         for k, d in enumerate((wide, draws)):
             found = estimate(time, d, blocks.n_blocks, log=True)
             inside = found.low <= ref <= found.high
