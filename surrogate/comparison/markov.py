@@ -237,7 +237,8 @@ def reversible(counts: FloatArray) -> tuple[FloatArray, FloatArray] | None:
         r, v = first - y, second - 2.0 * first + y
         if float(np.abs(r).max()) < _STEP_TOLERANCE:
             break
-        further = min(max(1.0, float(np.linalg.norm(r) / max(np.linalg.norm(v), 1e-300))), _FURTHEST)
+        ratio = float(np.linalg.norm(r)) / max(float(np.linalg.norm(v)), 1e-300)
+        further = min(max(1.0, ratio), _FURTHEST)
         jumped = step(y + 2.0 * further * r + further**2 * v)
         # A jump too far is none.
         good = bool(np.isfinite(jumped).all()) and np.abs(jumped - second).max() < _LONGEST_JUMP
