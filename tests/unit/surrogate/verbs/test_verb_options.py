@@ -116,7 +116,7 @@ def test_settings_and_campaigns_have_the_same_names_and_the_help_their_defaults(
         if flag.default is not None and flag.default != "default":
             assert flag.default == known[name], name
             continue
-        value = flag.read(text, name) if flag.read else type(known[name])(text)
+        value = flag.reader(text, name) if flag.reader else type(known[name])(text)
         assert value == pytest.approx(known[name]), name
         assert read_settings({key_of(name): value if name == "pressure_bar" else text})
 
