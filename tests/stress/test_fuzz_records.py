@@ -308,7 +308,7 @@ def test_names_of_files_hold_no_nul(tmp_path: Path) -> None:
 DOORS = {
     r"h5py\.File\((?!.*\"w\"\))": ("systems/files/outside.py",),
     r"np\.load(txt)?\(": ("systems/files/outside.py",),
-    r"gzip\.(open|decompress)\(": ("systems/chemistry/residues.py", "systems/trajectory/xyz_file.py"),
+    r"gzip\.(open|decompress)\b": ("systems/chemistry/residues.py", "systems/trajectory/foreign_readers.py"),
     r"json\.loads?\(": ("systems/files/schema.py",),
     r"tomllib\.loads?\(": ("surrogate/models/architecture.py",),
 }
