@@ -3,8 +3,8 @@
 Halves of one set share its start, so neither a replicate nor a bootstrap can see that a set still depends on it. Time
 can: equilibrium MD looks the same forwards and backwards, so that whatever grows along the replicas, more often than
 swapped signs of time would give, has not ended. What cannot drift because it never moves is counted: transitions,
-replicas that left their start, their length against the slowest relaxation. What an unconverged reference leaves open
-of a candidate's difference, and what differs all the same, is told by `explain`.
+replicas that left their start, their length against the slowest relaxation. `explain` says what an unconverged
+reference leaves open of a candidate's difference, and what differs all the same.
 """
 
 from __future__ import annotations
@@ -17,8 +17,9 @@ from functools import cached_property
 import numpy as np
 
 from surrogate.comparison.measure import kinetics
-from surrogate.comparison.measure.slow_motion import tic_0
-from surrogate.comparison.measure.statistics import Estimate, FloatArray, Segments
+from surrogate.comparison.measure.distributions import divergence
+from surrogate.comparison.measure.slow_motion import angles_of, tic_0
+from surrogate.comparison.measure.statistics import Estimate, FloatArray
 from surrogate.comparison.measure.structure import Backbone, Baseline, Features, evenly
 from surrogate.comparison.measure.torsions import Wells, find_wells
 from surrogate.comparison.read.ensemble import Ensemble, length_words
@@ -82,10 +83,6 @@ class State:
     def label(self) -> str:
         return f"{self.torsion} {self.name}".rstrip()
 
-    def quarters_in_words(self) -> str:
-        """Return such as '24, 50, 65, 60 %'."""
-        return ", ".join(f"{100 * q:.2g}" for q in self.quarters) + " %"
-
 
 @dataclass(frozen=True)
 class Convergence:
@@ -147,7 +144,7 @@ def convergence_of(
 ) -> Convergence:
     """Return the convergence of measured trajectories, all their segments together as replicas.
 
-    `wells`: the states of each angle of `angles_of`; found in these trajectories by default.
+    `wells`: the states of each angle; found in these trajectories by default.
     """
     features = long_enough(sets)
     lag_ps = sets[0].lag_ps
@@ -209,7 +206,7 @@ def state_columns(
 ) -> list[Column]:
     """Return every state of every angle that has two or more."""
     columns = []
-    found = angles_of(features, torsions) if features else []
+    found = evenly(angles_of(features, torsions), _MOST_TORSIONS) if features else []
     for k, (name, segments) in enumerate(found):
         well = find_wells(segments) if wells is None else wells[k]
         if len(well.names) < 2:
@@ -222,34 +219,13 @@ def state_columns(
     return columns
 
 
-def angles_of(features: Sequence[Features], torsions: Backbone) -> list[tuple[str, Segments]]:
-    """Return every torsion and ring pucker: its name and its values in rad `(n,)` per replica."""
-    first = features[0]
-    out: list[tuple[str, Segments]] = []
-    for symbol, labels in (("φ", torsions.phi_labels), ("ψ", torsions.psi_labels)):
-        for k, label in enumerate(labels):
-            series = [x[:, k] for f in features for x in (f.phi if symbol == "φ" else f.psi)]
-            out.append((f"{symbol} {label}", series))
-    if first.probes is not None and "torsions" in first.series:
-        for k, label in enumerate(first.probes.labels("torsions")):
-            out.append((label, [x[:, k] for f in features for x in f.series["torsions"]]))
-    if first.probes is not None and "puckers" in first.series:
-        for k, label in enumerate(first.probes.labels("puckers")):
-            if k % 2:
-                out.append((label, [x[:, k] for f in features for x in f.series["puckers"]]))
-    return evenly(out, _MOST_TORSIONS)
-
-
 def long_enough(sets: Sequence[Features]) -> list[Features]:
     """Return the sets without segments of fewer than 16 frames, in which no quarter means anything."""
     out = []
     for f in sets:
-        offset, parts = 0, []
-        for n in f.segment_lengths:
-            if n >= _LEAST_FRAMES:
-                parts.append(f.frames(offset, offset + n))
-            offset += n
-        out += [f] if len(parts) == len(f.segment_lengths) else parts
+        ends = np.cumsum(f.segment_lengths).tolist()
+        parts = [f.frames(end - n, end) for end, n in zip(ends, f.segment_lengths, strict=True) if n >= _LEAST_FRAMES]
+        out += [f] if len(parts) == len(ends) else parts
     return out
 
 
@@ -282,8 +258,6 @@ def _drift_p(columns: Sequence[Column], signs: FloatArray) -> FloatArray:
 
 def _map_p(features: Sequence[Features], torsions: Backbone, signs: FloatArray) -> float:
     """Return the p-value of the φ/ψ maps of first and second halves being one, by reversals of replicas as above."""
-    from surrogate.comparison.measure.distributions import divergence
-
     residues = evenly(torsions.residues, _MOST_MAPS)
     if not residues:
         return math.nan
@@ -336,39 +310,31 @@ def _evaluated(column: Column, drift_p: float, lag_ps: float, n_tests: int) -> S
     entries = exits = None
     left = started = 0
     fault, low, high = "", share - 2.0 * error, share + 2.0 * error
-    words = State(column.torsion, column.name, share, error, tuple(by_quarter.tolist()), (), drift_p, 0.0, 0.0, None,
-                  None, 0, 0, 0.0, 0.0).quarters_in_words()  # fmt: skip
     label = f"{column.torsion} {column.name}".rstrip()
-    upward = by_quarter @ _CONTRAST > 0
+    common = not column.is_state or RARE_BELOW <= share <= 1.0 - RARE_BELOW
     if column.is_state:
         entries, exits = column.passages()
         started = int((begun > 0).sum())
         left = sum(bool(x[0] > 0 and (x == 0).any()) for x in column.series)
-        common = RARE_BELOW <= share <= 1.0 - RARE_BELOW
         if entries + exits == 0 and 0.0 < share < 1.0:
             fault = f"{label} is held by the {started} of {n} replicas that began in it, and never entered or left"
-            low, high = 0.0, 1.0
         elif common and entries + exits < LEAST_PASSAGES:
             fault = f"{label} is entered or left {entries + exits} times in all, too few to know its share"
-            low, high = 0.0, 1.0
         elif (stuck := _stuck_p(column)) * n_tests < _SIGNIFICANCE:
             fault = f"a replica stays in {label} all along, which its rates elsewhere make {_chance(stuck)} likely"
-            low, high = 0.0, 1.0
-    else:
-        common = True
+        low, high = (0.0, 1.0) if fault else (low, high)
     moves = not column.is_state or float(np.ptp(by_quarter)) > _LEAST_BIAS
     if not fault and moves and drift_p < _SIGNIFICANCE:
-        fault = f"{label} drifts: {words} by quarters" if column.is_state else f"{label} drifts along the replicas"
-        low, high = (low, 1.0) if upward else (0.0, high)
+        words = ", ".join(f"{100 * q:.2g}" for q in by_quarter)
+        fault = f"{label} drifts: {words} % by quarters" if column.is_state else f"{label} drifts along the replicas"
+        low, high = (low, 1.0) if by_quarter @ _CONTRAST > 0 else (0.0, high)
     elif not fault and common and replica < LEAST_RELAXATIONS * tau:
         fault = (
             f"{label} relaxes in {format_time_ps(tau * lag_ps, 2)} or more, and the replicas are "
             f"{format_time_ps(replica * lag_ps, 2)}"
         )
-        if abs(late - start) > 3.0 * error:
-            low, high = (low, 1.0) if late > start else (0.0, high)
-        else:
-            low, high = 0.0, 1.0
+        known = abs(late - start) > 3.0 * error
+        low, high = (low if known and late > start else 0.0), (high if known and late <= start else 1.0)
     elif not fault and column.is_state and abs(bias) > _LEAST_BIAS:
         fault = f"{label} still carries about {100 * abs(bias):.2g} points of its start"
         low, high = (low, high + 2.0 * bias) if bias > 0 else (low + 2.0 * bias, high)
@@ -403,12 +369,11 @@ def _chance(p: float) -> str:
 def _summed_up(states: Sequence[State], map_p: float, lengths: Sequence[int], lag_ps: float) -> Convergence:
     """Return what all coordinates together say."""
     faulty = sorted((s for s in states if s.fault), key=lambda s: (s.torsion[:1] not in "φψ", -(s.high - s.low)))
-    reasons, named = [], set()
+    # Of one torsion the worst state is enough.
+    worst: dict[str, str] = {}
     for s in faulty:
-        # Of one torsion the worst state is enough.
-        if s.torsion not in named:
-            named.add(s.torsion)
-            reasons.append(s.fault)
+        worst.setdefault(s.torsion, s.fault)
+    reasons = list(worst.values())
     if not reasons and map_p < _SIGNIFICANCE:
         reasons.append(f"the φ/ψ map of the second halves is not that of the first (p = {map_p:.1g})")
     if not lengths:
@@ -509,7 +474,7 @@ def explain(
     theirs, own = long_enough(reference), long_enough([candidate])
     if not theirs or not own:
         return Explained(found.reasons)
-    pairs = zip(angles_of(theirs, torsions), angles_of(own, torsions), strict=True)
+    pairs = zip(*(evenly(angles_of(x, torsions), _MOST_TORSIONS) for x in (theirs, own)), strict=True)
     wells = [find_wells(a, b) for (_, a), (_, b) in pairs]
     references, mine = state_columns(theirs, torsions, wells), state_columns(own, torsions, wells)
     total_ps = sum(f.total_ps for f in theirs)

@@ -10,19 +10,18 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
 from surrogate.comparison.measure import distributions, kinetics
-from surrogate.comparison.measure.distributions import TORSION_BINS, Bins
+from surrogate.comparison.measure.distributions import TORSION_BINS
 from surrogate.comparison.measure.slow_motion import longest_correlation, slow_torsions, tica_features
 from surrogate.comparison.measure.statistics import (
     Blocks,
     Estimate,
     FloatArray,
     Piece,
-    Segments,
     block_length,
     bootstrap_weights,
     estimate,
@@ -353,19 +352,22 @@ def _measures(three: Three, torsions: Backbone, options: Options) -> list[Measur
     out = [_joint_measure(three, torsions)] if torsions.residues else []
     name, columns = _torsion_columns(three[0][0], torsions)
     if columns:
-        counts = [[_counts(_series(f, key), k, b) for f, b in three] for key, k in columns]
+        counts = [[distributions.block_counts(f.column(*c), TORSION_BINS, b) for f, b in three] for c in columns]
         out.append(_histogram_measure("torsion_jsd", name, counts))
         out += _tica_measures(three, options)
         moving = _correlation_measure(three)
         out += [moving] if moving is not None else []
     elif n_bonds := three[0][0].bonds_nm[0].shape[1]:
-        bins = [distributions.normal_bins([x[:, k] for x in three[0][0].bonds_nm]) for k in range(n_bonds)]
-        counts = [[_counts(f.bonds_nm, k, b, bins[k]) for f, b in three] for k in range(n_bonds)]
+        bonds = [[[x[:, k] for x in f.bonds_nm] for f, _ in three] for k in range(n_bonds)]
+        counts = [
+            [distributions.block_counts(x, distributions.normal_bins(of[0]), b) for x, (_, b) in zip(of, three)]
+            for of in bonds
+        ]
         out.append(_histogram_measure("bond_jsd", "bond lengths", counts))
     return out
 
 
-def _torsion_columns(reference: Features, torsions: Backbone) -> tuple[str, list[tuple[str, int]]]:
+def _torsion_columns(reference: Features, torsions: Backbone) -> tuple[str, list[tuple[Any, int]]]:
     """Return what the torsions are called together, and each as the series it is in and its column: phi and psi, or,
     where there are none, rotatable torsions; rotors of what has nothing else that turns."""
     backbone = [("phi", k) for k in range(len(torsions.phi))] + [("psi", k) for k in range(len(torsions.psi))]
@@ -376,14 +378,6 @@ def _torsion_columns(reference: Features, torsions: Backbone) -> tuple[str, list
         if chosen:
             return name, evenly([("torsions", k) for k in chosen], MOST_HISTOGRAMS)
     return "", []
-
-
-def _series(features: Features, key: str) -> Segments:
-    return features.series["torsions"] if key == "torsions" else getattr(features, key)
-
-
-def _counts(series: Segments, column: int, blocks: Blocks, bins: Bins = TORSION_BINS) -> FloatArray:
-    return distributions.block_counts([x[:, column] for x in series], bins, blocks)
 
 
 def _joint_measure(three: Three, torsions: Backbone) -> Measure:

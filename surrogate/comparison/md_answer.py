@@ -112,16 +112,16 @@ class Answer:
     @property
     def in_short(self) -> tuple[str, str, str]:
         """Three lines: whether to use it, for what and what is missing, why."""
-        told = [s for s in self.states if not s.missing]
+        weighted = [s for s in self.states if not s.missing]
         if self.is_by_surrogate:
             use = "Use the surrogate's populations for now, not MD's."
-            what = f"For {len(told)} states, to about {100 * MODEL_ERROR:.0f} % (assumed); MD does not contradict them."
+            what = f"For {len(weighted)} states, to about {100 * MODEL_ERROR:.0f} % (assumed); MD does not contradict them."
         elif not self.is_sure:
             use, what = "Do not use MD's populations yet.", f"They show which states there are: {len(self.states)}."
         else:
-            widest = 100 * max((s.error for s in told), default=0.0)
+            widest = 100 * max((s.error for s in weighted), default=0.0)
             use = "Use MD's answer" + (", but for what it did not connect." if self.missing else ".")
-            what = f"For populations and free energies of {len(told)} states, each to {widest:.2g} % or better"
+            what = f"For populations and free energies of {len(weighted)} states, each to {widest:.2g} % or better"
             what += " (one standard error)" + (", and relaxation times." if self.timescales_ps else ".")
         missing = f" Missing: {'; '.join(self.missing)}." if self.missing and not self.is_by_surrogate else ""
         slow = ""
@@ -130,7 +130,7 @@ class Answer:
             slow = f"; the slowest process takes {format_time_ps(self.timescales_ps[0], 2)}{error}"
         length = f"{self.n_replicas} replicas of {format_time_ps(self.replica_ps, 2)}"
         if self.is_by_surrogate:
-            not_yet = f" and off by up to {100 * max(s.error for s in told):.2g} %"
+            not_yet = f" and off by up to {100 * max(s.error for s in weighted):.2g} %"
         else:
             not_yet = "" if self.is_sure else " and has not converged"
         return use, what + missing, f"Why: MD is {length}, weighed by {self.tests}{not_yet}{slow}."
@@ -138,20 +138,20 @@ class Answer:
     @property
     def on_surrogate(self) -> str:
         """One sentence about the surrogate's populations; empty where there is none."""
-        told = [s for s in self.states if s.surrogate is not None and not s.missing]
-        if not told:
+        weighted = [s for s in self.states if s.surrogate is not None and not s.missing]
+        if not weighted:
             return ""
-        off = sorted((s for s in told if s.differs), key=lambda s: -abs((s.surrogate or 0.0) - s.share))
+        off = sorted((s for s in weighted if s.differs), key=lambda s: -abs((s.surrogate or 0.0) - s.share))
         if not off:
-            widest = max(s.error for s in told)
+            widest = max(s.error for s in weighted)
             return (
-                f"The surrogate's populations agree with MD's in all {len(told)} states, within errors of up to "
+                f"The surrogate's populations agree with MD's in all {len(weighted)} states, within errors of up to "
                 f"{100 * widest:.2g} %."
             )
         worst = off[0]
         instead = f"{100 * (worst.surrogate or 0.0):.3g} % instead of {percent(worst.share, worst.error)}"
         return (
-            f"The surrogate's populations differ from MD's in {len(off)} of {len(told)} states, most in "
+            f"The surrogate's populations differ from MD's in {len(off)} of {len(weighted)} states, most in "
             f"{worst.torsion} {worst.state}: {instead}."
         )
 

@@ -163,9 +163,8 @@ def untested(rows: Sequence[Row], *, start: bool = False) -> list[Row]:
 
 
 def status(rows: Sequence[Row], cautions: Cautions = SURE) -> Status:
-    """Return the word for the whole: that of the worst row; undecided when most statistical rows are, or by `doubts`.
-
-    Frames that are no molecule are so whatever the cautions are."""
+    """Return the word for the whole: that of the worst row; undecided when most statistical rows are, or by
+    `cautions`, but that frames which are no molecule are so all the same."""
     words = [r.verdict for r in rows]
     if "fails" in words:
         return "broken"
@@ -197,14 +196,11 @@ def unlike(rows: Sequence[Row], options: Options) -> list[str]:
     """Return a warning where the replicate itself differs from the reference (Holm over all rows)."""
     corrected = holm([math.nan if r.form == "share" else r.p_replicate for r in rows])
     off = [r.metric for r, p in zip(rows, corrected, strict=True) if p < options.significance]
-    return (
-        [
-            f"The replicate itself differs from the reference ({'; '.join(off)}): the two are not samples of one "
-            "simulation, or too short; trust no verdict on these metrics."
-        ]
-        if off
-        else []
+    warning = (
+        f"The replicate itself differs from the reference ({'; '.join(off)}): the two are not samples of one "
+        "simulation, or too short; trust no verdict on these metrics."
     )
+    return [warning] if off else []
 
 
 def _excess(row: Row) -> float:

@@ -34,11 +34,12 @@ import surrogate as sm
 from md_reference.run.machine import machine_name
 from md_reference.run.replicas import simulate_replicas
 from md_reference.simd.force_field import n_replicas
-from surrogate.comparison.convergence import angles_of, tested_reference
+from surrogate.comparison.convergence import tested_reference
 from surrogate.comparison.equivalent_time import EquivalentTime
 from surrogate.comparison.md_answer import MODEL_ERROR, Answer, md_answer
 from surrogate.comparison.measure.distributions import distance
-from surrogate.comparison.measure.structure import Baseline
+from surrogate.comparison.measure.slow_motion import angles_of
+from surrogate.comparison.measure.structure import Baseline, evenly
 from surrogate.comparison.measure.torsions import find_wells
 from surrogate.comparison.read.ensemble import Ensemble, load_ensemble
 from surrogate.verbs.options import ReferenceOptions
@@ -204,7 +205,7 @@ def stretch(ensemble: Ensemble, first: int, last: int | None) -> Ensemble:
 def measured(baseline: Baseline, ensemble: Ensemble) -> Angles:
     """Return every torsion in rad, `(n_frames,)` a replica."""
     return {k: [np.asarray(x, dtype=np.float64) for x in s]
-            for k, s in angles_of([baseline.measure(ensemble)], baseline.torsions)}  # fmt: skip
+            for k, s in evenly(angles_of([baseline.measure(ensemble)], baseline.torsions), 64)}  # fmt: skip
 
 
 def pooled(segments: Sequence[FloatArray], weights: Sequence[FloatArray] | None) -> tuple[FloatArray, FloatArray]:

@@ -10,8 +10,8 @@ import numpy as np
 import numpy.typing as npt
 
 from surrogate.comparison.measure import kinetics
-from surrogate.comparison.measure.statistics import BoolArray, FloatArray
-from surrogate.comparison.measure.structure import Family, Features
+from surrogate.comparison.measure.statistics import BoolArray, FloatArray, Segments
+from surrogate.comparison.measure.structure import Backbone, Features
 
 # More series than this, and only those are followed whose means over blocks vary most.
 _MOST_FOLLOWED = 48
@@ -44,7 +44,7 @@ def longest_correlation(*features: Features) -> float:
 def rarely_crossed(references: Sequence[Features], candidate: Features) -> list[str]:
     """Return the torsions by which candidate and reference lie in different states that hardly any run passes between:
     replicas of one simulation do that, too."""
-    runs = [_angles(t) for t in (*references, candidate)]
+    runs = [angles_of([t]) for t in (*references, candidate)]
     found = []
     for k, (label, own) in enumerate(runs[-1]):
         p, q = _density(own), _density([x for angles in runs[:-1] for x in angles[k][1]])
@@ -60,16 +60,26 @@ def rarely_crossed(references: Sequence[Features], candidate: Features) -> list[
     return found
 
 
-def _angles(features: Features) -> list[tuple[str, list[npt.NDArray[Any]]]]:
-    """Return the name and the values in rad `(n,)` per segment of every torsion and of every ring's pucker."""
-    out = []
-    for symbol, series in (("φ", features.phi), ("ψ", features.psi)):
-        out += [(f"{symbol} {k + 1}", [x[:, k] for x in series]) for k in range(series[0].shape[1])]
-    families: tuple[tuple[Family, int, int], ...] = (("torsions", 0, 1), ("puckers", 1, 2))
-    for family, first, step in families if features.probes is not None else ():
-        names = features.probes.labels(family)[first::step] if features.probes else []
-        out += [(n, [x[:, first + step * k] for x in features.series[family]]) for k, n in enumerate(names)]
-    return out
+def angles_of(features: Sequence[Features], torsions: Backbone | None = None) -> list[tuple[str, Segments]]:
+    """Return every torsion and ring pucker: its name and its values in rad `(n,)` per segment of all trajectories.
+
+    `torsions`: by which φ and ψ are named; by their number where None.
+    """
+    first, probes = features[0], features[0].probes
+    count = [str(k + 1) for k in range(max(first.phi[0].shape[1], first.psi[0].shape[1]))]
+    phi, psi = (torsions.phi_labels, torsions.psi_labels) if torsions else (count, count)
+    families: list[tuple[Any, Sequence[str], int, int]] = [
+        ("phi", [f"φ {x}" for x in phi[: first.phi[0].shape[1]]], 0, 1),
+        ("psi", [f"ψ {x}" for x in psi[: first.psi[0].shape[1]]], 0, 1),
+    ]
+    if probes is not None:
+        # Of a ring: its amplitude, then its angle.
+        families += [("torsions", probes.labels("torsions"), 0, 1), ("puckers", probes.labels("puckers")[1::2], 1, 2)]
+    return [
+        (name, [x for f in features for x in f.column(family, start + step * k)])
+        for family, names, start, step in families
+        for k, name in enumerate(names)
+    ]
 
 
 def _density(segments: Sequence[npt.NDArray[Any]]) -> FloatArray | None:
@@ -98,22 +108,15 @@ def _passages(angles: npt.NDArray[Any], apart: BoolArray) -> int:
 def _all_series(features: Sequence[Features]) -> Iterator[list[FloatArray]]:
     """Yield every scalar that may move slowly, segments of all trajectories one after another."""
     first = features[0]
-
-    def columns(family: Any, start: int = 0, step: int = 1) -> list[list[npt.NDArray[Any]]]:
-        every = [x for f in features for x in (getattr(f, family) if family in ("phi", "psi") else f.series[family])]
-        return [[x[:, k] for x in every] for k in range(start, every[0].shape[1], step)]
-
-    phi = columns("phi")
-    for angle in phi:
-        yield [np.where(np.isfinite(x), x > 0, np.nan) for x in angle]
-    # Of a ring: its amplitude, then its angle.
-    further = [*columns("torsions"), *columns("puckers", 1, 2)] if first.series else []
-    angles = [*phi, *columns("psi"), *further]
+    angles = [x for _, x in angles_of(features)]
+    for phi in angles[: first.phi[0].shape[1]]:
+        yield [np.where(np.isfinite(x), x > 0, np.nan) for x in phi]
     for angle in angles:
         yield [np.cos(x.astype(np.float64)) for x in angle]
         yield [np.sin(x.astype(np.float64)) for x in angle]
     if first.series:
-        yield from ([x.astype(np.float64) for x in column] for column in columns("shape"))
+        for k in range(first.series["shape"][0].shape[1]):
+            yield [x.astype(np.float64) for f in features for x in f.column("shape", k)]
     elif not angles and first.bonds_nm[0].shape[1]:
         yield [np.asarray(x.mean(1), dtype=np.float64) for f in features for x in f.bonds_nm]
 

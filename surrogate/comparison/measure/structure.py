@@ -582,6 +582,11 @@ class Features(InSegments):
     def segment_lengths(self) -> list[int]:
         return [len(f) for f in self.flags]
 
+    def column(self, family: Family | Literal["phi", "psi"], k: int) -> list[npt.NDArray[Any]]:
+        """Return one column `(n,)` per segment of phi, of psi or of a family."""
+        columns = self.phi if family == "phi" else self.psi if family == "psi" else self.series[family]
+        return [x[:, k] for x in columns]
+
     def frames(self, start: int, stop: int) -> Features:
         """Return frames `start:stop`, counted through the segments in order; segments keep their bounds."""
         spans = []

@@ -25,8 +25,7 @@ if TYPE_CHECKING:
 MAP_MAX_KJ = 20.0
 MAP_SIZE, CURVE_SIZE = (2.95, 2.5), (2.95, 2.3)
 DIFFERENCE_MAX_KJ = 4.0
-# The two ends of the difference map, in words: high (too rare) and low (too frequent).
-DIFFERENCE_COLOURS = ("orange", "purple")
+_DIFFERENCE_CAPTION = "Candidate minus reference: orange where the candidate comes too rarely, purple where too often"
 _MIN_COUNT = 5
 # Characters in a line below a narrow picture.
 _LABEL_WIDTH = 36
@@ -108,16 +107,6 @@ def draw(title: str, size: tuple[float, float], paint: Callable[[Any, Any], None
     return svg.replace("<svg", f'<svg role="img" aria-label="{html.escape(title, quote=True)}"', 1)
 
 
-def _visible(colours: str) -> Any:
-    """Return a colour map without its darkest ends where it diverges: they would vanish on a dark page."""
-    from matplotlib import colormaps
-    from matplotlib.colors import ListedColormap
-
-    if colours != "PuOr_r":
-        return colormaps[colours]
-    return ListedColormap(colormaps[colours](np.linspace(0.14, 0.86, 256)))
-
-
 def _degrees(axes: Any, *, both: bool) -> None:
     ticks = [-180, -90, 0, 90, 180]
     axes.set_xticks(ticks)
@@ -125,58 +114,6 @@ def _degrees(axes: Any, *, both: bool) -> None:
     if both:
         axes.set_yticks(ticks)
         axes.set_ylim(-180, 180)
-
-
-def difference_kj(reference: FloatArray, candidate: FloatArray, temperature_k: float) -> tuple[FloatArray, float]:
-    """Return candidate minus reference in kJ/mol, cut off at the second number; NaN where there are too few counts."""
-    rt_kj = GAS_CONSTANT_KJ_MOL_K * temperature_k
-    p_reference, p_candidate = (counts / max(counts.sum(), 1.0) for counts in (reference, candidate))
-    with np.errstate(divide="ignore", invalid="ignore"):
-        change = -rt_kj * np.log(p_candidate / p_reference)
-    enough = np.maximum(reference, candidate) >= _MIN_COUNT
-    return np.where(enough, np.clip(change, -DIFFERENCE_MAX_KJ, DIFFERENCE_MAX_KJ), np.nan), DIFFERENCE_MAX_KJ
-
-
-def map_caption() -> str:
-    """Return what a difference map shows."""
-    rare, often = DIFFERENCE_COLOURS
-    return f"Candidate minus reference: {rare} where the candidate comes too rarely, {often} where too often"
-
-
-def _map_note(temperature_k: float) -> str:
-    """Return what stands below a row of maps."""
-    return (
-        f"Free energy in kJ/mol at {temperature_k:.0f} K above the deepest bin, up to {MAP_MAX_KJ:.0f} kJ/mol, 50 × 50 "
-        "bins; what was never visited is left empty. In the difference, bins with fewer than 5 counts are left empty "
-        "and bins that only one of the two visits stand at the end of the scale."
-    )
-
-
-def paint_map(
-    figure: Any,
-    axes: Any,
-    values: FloatArray,
-    colours: str,
-    limits: tuple[float, float],
-    step: float,
-    extent: tuple[float, float, float, float],
-) -> None:
-    """Paint `values (n_x, n_y)` kJ/mol over `extent` (left, right, bottom, top) with a colour bar; NaN stays empty."""
-    axes.set_facecolor(EMPTY)
-    image = axes.imshow(
-        values.T,
-        origin="lower",
-        extent=extent,
-        aspect="auto",
-        cmap=_visible(colours),
-        vmin=limits[0],
-        vmax=limits[1],
-        interpolation="nearest",
-    )
-    bar = figure.colorbar(image, ax=axes, shrink=0.9, pad=0.02)
-    bar.outline.set_visible(False)
-    bar.set_ticks(np.arange(limits[0], limits[1] + 0.5 * step, step).tolist())
-    bar.ax.set_title("kJ/mol", fontsize=8, pad=5)
 
 
 def histogram(data: Histogram) -> str:
@@ -189,14 +126,8 @@ def histogram(data: Histogram) -> str:
             (data.replicate, REPLICATE, (0, (4, 2))),
             (data.candidate, CANDIDATE, "solid"),
         ):
-            axes.stairs(
-                values / scale,
-                data.edges * scale,
-                color=colour,
-                linestyle=style,
-                linewidth=1.4,
-                baseline=None,
-            )
+            edges = data.edges * scale
+            axes.stairs(values / scale, edges, color=colour, linestyle=style, linewidth=1.4, baseline=None)
         axes.set_xlim(data.edges[0] * scale, data.edges[-1] * scale)
         axes.set_ylim(bottom=0)
         if data.unit == "rad":
@@ -217,14 +148,10 @@ def draw_chart(chart: Chart, temperature_k: float) -> list[Figure]:
         outside = chart.outside[1]
         beyond = f"; {100 * outside:.2g} % of the candidate's frames lie outside" if outside > 0 else ""
         return [Figure(histogram(chart), f"Distribution of {chart.label}{beyond}")]
-    if isinstance(chart, BarChart):
-        shown = f"The first {_MAX_NAMES} of {len(chart.names)}." if len(chart.names) > _MAX_NAMES else ""
-        return [Figure(_bars(chart), _caption(chart.title, " ".join(filter(None, (chart.caption, shown)))))]
-    return [Figure(_lines(chart), _caption(chart.title, chart.caption))]
-
-
-def _caption(title: str, caption: str) -> str:
-    return f"{title}: {caption}" if caption else title
+    caption, drawn = chart.caption, _bars(chart) if isinstance(chart, BarChart) else _lines(chart)
+    if isinstance(chart, BarChart) and len(chart.names) > _MAX_NAMES:
+        caption = f"{caption} The first {_MAX_NAMES} of {len(chart.names)}.".lstrip()
+    return [Figure(drawn, f"{chart.title}: {caption}" if caption else chart.title)]
 
 
 def _lines(chart: LineChart) -> str:
@@ -328,14 +255,29 @@ def energy_map(
     energy_kj: FloatArray,
     edges: tuple[FloatArray, FloatArray],
     labels: tuple[str, str],
-    colours: str = "viridis_r",
-    limits: tuple[float, float] = (0.0, MAP_MAX_KJ),
+    *,
+    difference: bool = False,
 ) -> str:
-    """Return one map of energies `(n_x, n_y)` kJ/mol over x and y; NaN stays empty."""
+    """Return one map of energies `(n_x, n_y)` kJ/mol over x and y, or of a `difference` of two; NaN stays empty."""
     box = (float(edges[0][0]), float(edges[0][-1]), float(edges[1][0]), float(edges[1][-1]))
+    low, high = (-DIFFERENCE_MAX_KJ, DIFFERENCE_MAX_KJ) if difference else (0.0, MAP_MAX_KJ)
+    step = (high - low) / 4
 
     def paint(figure: Any, axes: Any) -> None:
-        paint_map(figure, axes, energy_kj, colours, limits, (limits[1] - limits[0]) / 4, box)
+        from matplotlib import colormaps
+        from matplotlib.colors import ListedColormap
+
+        # Without the darkest ends of a diverging scale: they would vanish on a dark page.
+        diverging = ListedColormap(colormaps["PuOr_r"](np.linspace(0.14, 0.86, 256)))
+        axes.set_facecolor(EMPTY)
+        image = axes.imshow(
+            energy_kj.T, origin="lower", extent=box, aspect="auto", vmin=low, vmax=high, interpolation="nearest",
+            cmap=diverging if difference else colormaps["viridis_r"],
+        )  # fmt: skip
+        bar = figure.colorbar(image, ax=axes, shrink=0.9, pad=0.02)
+        bar.outline.set_visible(False)
+        bar.set_ticks(np.arange(low, high + 0.5 * step, step).tolist())
+        bar.ax.set_title("kJ/mol", fontsize=8, pad=5)
         in_degrees = labels[0].endswith("°")
         if in_degrees:
             _degrees(axes, both=True)
@@ -347,14 +289,19 @@ def energy_map(
 
 def _landscape(chart: Landscape, temperature_k: float) -> list[Figure]:
     where = (chart.x_edges, chart.y_edges), (chart.x_label, chart.y_label)
+    three = chart.reference, chart.candidate, chart.replicate
     out = []
-    for caption, counts in zip(chart.captions, (chart.reference, chart.candidate, chart.replicate), strict=True):
+    for caption, counts in zip(chart.captions, three, strict=True):
         energy = np.clip(free_energy_kj(counts, temperature_k), 0.0, MAP_MAX_KJ)
         out.append(Figure(energy_map(f"{caption}, {chart.title}", energy, *where), caption))
-    change, limit = difference_kj(chart.reference, chart.candidate, temperature_k)
-    title = f"Candidate minus reference, {chart.title}"
-    out.append(Figure(energy_map(title, change, *where, "PuOr_r", (-limit, limit)), map_caption()))
-    return out
+    # Candidate minus reference, empty where there are too few counts.
+    p, q = (counts / max(counts.sum(), 1.0) for counts in three[:2])
+    with np.errstate(divide="ignore", invalid="ignore"):
+        change = -GAS_CONSTANT_KJ_MOL_K * temperature_k * np.log(q / p)
+    enough = np.maximum(*three[:2]) >= _MIN_COUNT
+    change = np.where(enough, np.clip(change, -DIFFERENCE_MAX_KJ, DIFFERENCE_MAX_KJ), np.nan)
+    picture = energy_map(f"Candidate minus reference, {chart.title}", change, *where, difference=True)
+    return [*out, Figure(picture, _DIFFERENCE_CAPTION)]
 
 
 class Album(NamedTuple):
@@ -368,7 +315,11 @@ class Album(NamedTuple):
 def albums(charts: Sequence[Chart], temperature_k: float) -> list[Album]:
     """Return the charts of one candidate by section, landscapes each by themselves; of a long series the first."""
     out: list[Album] = []
-    note = _map_note(temperature_k)
+    note = (
+        f"Free energy in kJ/mol at {temperature_k:.0f} K above the deepest bin, up to {MAP_MAX_KJ:.0f} kJ/mol, 50 × 50 "
+        "bins; what was never visited is left empty. In the difference, bins with fewer than 5 counts are left empty "
+        "and bins that only one of the two visits stand at the end of the scale."
+    )
     for section, title in _TITLES.items():
         mine = [c for c in charts if c.section == section]
         # A landscape is a row of maps; the last is that of TICA.
@@ -433,12 +384,10 @@ def answer_overview(molecule: str, answer: dict[str, Any]) -> MatplotlibFigure:
     states = [s for s in answer.get("states", []) if not s["missing"]]
     figure: Any = Figure(figsize=(4.0 * (1 + len(maps)), max(3.5, 0.22 * len(states))), layout="constrained")
     bars, *others = figure.subplots(1, 1 + len(maps), squeeze=False)[0]
-    bars.barh(
-        range(len(states)), [s["share"] for s in states], xerr=[s["error"] for s in states], color="0.75", label="MD"
-    )
-    rolled = [
-        (k, s["surrogate"], s["surrogate_error"] or 0.0) for k, s in enumerate(states) if s["surrogate"] is not None
-    ]
+    shares, errors = ([s[key] for s in states] for key in ("share", "error"))
+    bars.barh(range(len(states)), shares, xerr=errors, color="0.75", label="MD")
+    own = [(k, s["surrogate"], s["surrogate_error"]) for k, s in enumerate(states)]
+    rolled = [(k, share, error or 0.0) for k, share, error in own if share is not None]
     if rolled:
         at, share, error = zip(*rolled, strict=True)
         bars.errorbar(share, at, xerr=error, fmt="o", color="C1", label="surrogate")
@@ -460,13 +409,9 @@ def weighted_maps(maps: dict[str, FloatArray]) -> list[Figure]:
     """Return the report's pictures of MD's answer: the free energy (kJ/mol, `(36, 36)`) of the first residues."""
     edges = np.linspace(-180.0, 180.0, 37)
 
-    def shown(energy: FloatArray) -> FloatArray:
-        return np.where(np.isfinite(energy), np.minimum(energy, MAP_MAX_KJ), np.nan)
-
-    return [
-        Figure(
-            energy_map(f"By MD's weights, {label}", shown(energy), (edges, edges), ("φ / °", "ψ / °")),
-            f"{label}: free energy by MD's answer, all its frames weighted",
-        )
-        for label, energy in list(maps.items())[:_MOST_ANSWER_MAPS]
-    ]
+    found = []
+    for label, energy in list(maps.items())[:_MOST_ANSWER_MAPS]:
+        shown = np.where(np.isfinite(energy), np.minimum(energy, MAP_MAX_KJ), np.nan)
+        picture = energy_map(f"By MD's weights, {label}", shown, (edges, edges), ("φ / °", "ψ / °"))
+        found.append(Figure(picture, f"{label}: free energy by MD's answer, all its frames weighted"))
+    return found

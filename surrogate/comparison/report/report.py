@@ -87,12 +87,9 @@ def render(comparison: Comparison, *, command: str, foreword: Foreword | None = 
     def text_of(name: str) -> str:
         return package.joinpath(name).read_text("utf-8")
 
+    loader = DictLoader({name: text_of(name) for name in ("report.html.j2", "macros.html.j2")})
     environment = Environment(
-        loader=DictLoader({name: text_of(name) for name in ("report.html.j2", "macros.html.j2")}),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
+        loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )
     environment.filters.update(
         number=number, interval=interval, time=format_time_ps, plain=plain, setting=setting, sort_key=sort_key
@@ -102,7 +99,7 @@ def render(comparison: Comparison, *, command: str, foreword: Foreword | None = 
             "evaluation": j,
             "anchor": f"candidate-{i + 1}",
             "cards": cards(j),
-            "groups": [(GROUP_TITLES.get(g, g.capitalize()), [r for r in j.rows if r.group == g]) for g in GROUPS],
+            "groups": [(GROUP_TITLES[g], [r for r in j.rows if r.group == g]) for g in GROUPS],
             "albums": albums(j.charts, comparison.temperature_k),
             "movie": comparison.movies[i] if i < len(comparison.movies) else None,
         }
@@ -135,10 +132,8 @@ def _embed(value: object) -> str:
 
 def _summaries(comparison: Comparison) -> list[tuple[str, Summary, str]]:
     """Every trajectory with its role and its speed in words."""
-    listed = [("Reference", comparison.reference)]
-    listed += [("Candidate", j.summary) for j in comparison.evaluations]
-    if comparison.replicate is not None:
-        listed.append(("Replicate", comparison.replicate))
+    listed = [("Reference", comparison.reference), *(("Candidate", j.summary) for j in comparison.evaluations)]
+    listed += [] if comparison.replicate is None else [("Replicate", comparison.replicate)]
     return [(role, a, per_day(a.ns_per_day)) for role, a in listed]
 
 
@@ -192,11 +187,8 @@ def to_markdown(comparison: Comparison, *, command: str, headline: str = "") -> 
         parts.append(f"**{mark} {_text(evaluation.summary.label)}**: {use}\n- {for_what}\n- {why}")
         parts.append(_text(evaluation.verdict))
     if comparison.convergence is not None:
-        parts += [
-            "## Has the reference forgotten its start?",
-            _text(comparison.convergence.verdict),
-            _drifts(comparison),
-        ]
+        drifts = _table(STATE_HEADS, state_lines(comparison.convergence))
+        parts += ["## Has the reference forgotten its start?", _text(comparison.convergence.verdict), drifts]
     if len(comparison.evaluations) > 1:
         parts += ["## Side by side", _side_by_side(comparison)]
     for evaluation in comparison.evaluations:
@@ -212,15 +204,18 @@ def to_markdown(comparison: Comparison, *, command: str, headline: str = "") -> 
 
 
 def _candidate(evaluation: Evaluation) -> list[str]:
-    headline = [
+    shown = [
         f"- {card.title}: {_text(card.value)}" + (f" ({_text(card.note)})" if card.note else "")
         for card in cards(evaluation)
     ]
-    out = [f"## {_text(evaluation.summary.label)}", "\n".join(headline)]
+    out = [f"## {_text(evaluation.summary.label)}", "\n".join(shown)]
     if evaluation.findings:
         out.append("What is off, worst first:")
         out.append("\n".join(f"{k}. {_text(x)}" for k, x in enumerate(evaluation.findings, 1)))
-    rows = [_metric(row, title) for g in GROUPS for title, row in _of_group(evaluation.rows, g)]
+    rows, group = [], ""
+    for row in evaluation.rows:
+        rows.append(_metric(row, "" if row.group == group else GROUP_TITLES[row.group]))
+        group = row.group
     out.append(_table(("", "Metric", "Reference", "Candidate", "Replicate", "Ratio", "Tolerance", "Verdict"), rows))
     out.append(
         f"Compared over {format_time_ps(evaluation.compared_ps)} ({evaluation.n_frames} frames) each; in brackets 95 % "
@@ -230,11 +225,6 @@ def _candidate(evaluation: Evaluation) -> list[str]:
     return out + _list("Equal terms", evaluation.notes)
 
 
-def _of_group(rows: Sequence[Row], group: str) -> list[tuple[str, Row]]:
-    mine = [row for row in rows if row.group == group]
-    return [(GROUP_TITLES.get(group, group.capitalize()) if k == 0 else "", row) for k, row in enumerate(mine)]
-
-
 def _metric(row: Row, title: str) -> tuple[str, ...]:
     name = f"{row.metric} / {row.unit}" if row.unit else row.metric
     values = [f"{number(e)} {interval(e)}".rstrip() for e in (row.reference, row.candidate, row.replicate)]
@@ -242,38 +232,27 @@ def _metric(row: Row, title: str) -> tuple[str, ...]:
 
 
 def _side_by_side(comparison: Comparison) -> str:
-    def cell(row: Row | None) -> str:
-        return "–" if row is None else f"{MARKS[row.verdict]} {number(row.candidate)}"
-
     labels = [j.summary.label for j in comparison.evaluations]
     rows = []
     for line in side_by_side(comparison):
         name = f"{line.metric} / {line.unit}" if line.unit else line.metric
-        ref: Estimate | None = line.first.reference or line.first.replicate
-        rows.append((name, number(ref), *(cell(row) for row in line.rows)))
+        cells = ["–" if row is None else f"{MARKS[row.verdict]} {number(row.candidate)}" for row in line.rows]
+        rows.append((name, number(line.first.reference or line.first.replicate), *cells))
     return _table(("Metric", "Reference (of a distance: the replicate's)", *labels), rows)
 
 
 def _costs(comparison: Comparison) -> str:
-    listed = [("Reference", comparison.reference)]
-    listed += [("Candidate", j.summary) for j in comparison.evaluations]
-    if comparison.replicate is not None:
-        listed.append(("Replicate", comparison.replicate))
     rows = [
         (
             f"{role}: {a.label}",
             a.length,
             f"{a.n_frames}, every {format_time_ps(a.lag_ps)}",
             "not recorded" if a.wall_s is None else f"{a.wall_s:.4g} s",
-            per_day(a.ns_per_day),
+            speed,
         )
-        for role, a in listed
+        for role, a, speed in _summaries(comparison)
     ]
     return _table(("Trajectory", "Length", "Frames", "Wall time", "Speed"), rows)
-
-
-def _drifts(comparison: Comparison) -> str:
-    return _table(STATE_HEADS, state_lines(comparison.convergence)) if comparison.convergence else ""
 
 
 def _table(heads: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
@@ -424,14 +403,8 @@ def cards(evaluation: Evaluation) -> list[Card]:
     out = []
     if evaluation.equivalent_time_words and evaluation.equivalent_time:
         best = evaluation.equivalent_time[0]
-        out.append(
-            Card(
-                f"Equivalent MD time, by its {best.measure}",
-                f"{best.in_words().split(' [')[0]} of MD",
-                best.in_words(),
-                "",
-            )
-        )
+        words = best.in_words()
+        out.append(Card(f"Equivalent MD time, by its {best.measure}", f"{words.split(' [')[0]} of MD", words, ""))
     out.append(Card("Valid frames", f"{number(valid.candidate)} %", others, valid.verdict))
     joint = worst([r for r in evaluation.rows if r.key.startswith("joint_jsd")])
     if joint is not None:

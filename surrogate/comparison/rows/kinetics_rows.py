@@ -76,10 +76,10 @@ def turning(features: Features) -> list[tuple[str, str, list[FloatArray]]]:
     """Return what relaxation is measured by: symbol, label and cosine `(n,)` per segment of every psi, or, where there
     is none, of every rotatable torsion, folded as it is."""
     if features.psi[0].shape[1] or features.probes is None:
-        found = [("ψ", "", [x[:, k] for x in features.psi]) for k in range(features.psi[0].shape[1])]
+        found = [("ψ", "", features.column("psi", k)) for k in range(features.psi[0].shape[1])]
     else:
-        torsions, series = features.probes.torsions, features.series["torsions"]
-        found = [("", torsions[k].label, [x[:, k] for x in series]) for k in slow_torsions(features)]
+        torsions = features.probes.torsions
+        found = [("", torsions[k].label, features.column("torsions", k)) for k in slow_torsions(features)]
     return [(symbol, label, [np.cos(x.astype(np.float64)) for x in column]) for symbol, label, column in found]
 
 

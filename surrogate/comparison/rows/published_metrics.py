@@ -15,7 +15,6 @@ shared frame held still, and the last shared step repeated for ever.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -67,18 +66,13 @@ class Fit:
     coordinates: list[FloatArray]
 
 
-def torsion_columns(features: Features) -> tuple[list[list[FloatArray]], list[list[FloatArray]]]:
+def torsion_columns(features: Features) -> tuple[list[Segments], list[Segments]]:
     """Return the backbone torsions (phi, psi) and the side-chain ones (chi), each a list of segments `(n,)` in rad."""
-
-    def columns(series: Segments, chosen: Sequence[int]) -> list[list[FloatArray]]:
-        return [[np.asarray(x[:, k], dtype=np.float64) for x in series] for k in chosen]
-
-    backbone = [c for series in (features.phi, features.psi) for c in columns(series, range(series[0].shape[1]))]
-    if features.probes is None:
-        return backbone, []
+    backbone: list[Segments] = [features.column("phi", k) for k in range(features.phi[0].shape[1])]
+    backbone += [features.column("psi", k) for k in range(features.psi[0].shape[1])]
     # Folded torsions turn m times as fast; the recipe knows of no symmetry, but neither can what was measured.
-    side = [k for k, t in enumerate(features.probes.torsions) if t.kind == "χ"]
-    return backbone, columns(features.series["torsions"], side)
+    torsions = enumerate(features.probes.torsions if features.probes else ())
+    return backbone, [features.column("torsions", k) for k, t in torsions if t.kind == "χ"]
 
 
 def histogram_distance(p: Segments, q: Segments, low: float, high: float) -> float:

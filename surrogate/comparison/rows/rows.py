@@ -201,6 +201,10 @@ class ComparisonInput:
         """Reference, candidate, replicate."""
         return self.reference, self.candidate, self.replicate
 
+    def column(self, family: Family | Literal["phi", "psi"], k: int) -> list[Segments]:
+        """Return one column `(n,)` per segment of phi, of psi or of a family, of each sample."""
+        return [s.features.column(family, k) for s in self.samples]
+
     def families(self, family: Family, *columns: int) -> list[Segments]:
         """Return the columns `(n, k)` of one family of each sample: those named, or all."""
         every = [s.family(family) for s in self.samples]

@@ -12,11 +12,12 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 
 from surrogate.comparison.measure import distributions, kinetics
-from surrogate.comparison.measure.distributions import RAMACHANDRAN_BINS, TORSION_BINS, block_counts_joint
+from surrogate.comparison.measure.distributions import RAMACHANDRAN_BINS, TORSION_BINS
 from surrogate.comparison.measure.slow_motion import slow_torsions, tica_features
 from surrogate.comparison.measure.statistics import (
     BLOCK_IN_CORRELATION_TIMES,
@@ -155,23 +156,18 @@ def torsion_rows(inputs: ComparisonInput) -> Measured:
     ]
     for symbol, key, labels in _phi_psi(inputs):
         for k, label in evenly(list(enumerate(labels)), _MOST_DRAWN):
-            charts.append(histogram(inputs, _angle(inputs, key, k), TORSION_BINS, f"{symbol} {label}", "rad"))
+            charts.append(histogram(inputs, inputs.column(key, k), TORSION_BINS, f"{symbol} {label}", "rad"))
     return Measured(rows, charts)
 
 
-def _phi_psi(inputs: ComparisonInput) -> list[tuple[str, str, tuple[str, ...]]]:
+def _phi_psi(inputs: ComparisonInput) -> list[tuple[str, Literal["phi", "psi"], tuple[str, ...]]]:
     return [("φ", "phi", inputs.torsions.phi_labels), ("ψ", "psi", inputs.torsions.psi_labels)]
-
-
-def _angle(inputs: ComparisonInput, key: str, k: int) -> Three:
-    """Return one of the angles phi or psi `(n,)` per segment of each sample."""
-    return [[x[:, k] for x in getattr(s.features, key)] for s in inputs.samples]
 
 
 def joint_counts(f: Features, blocks: Blocks, residue: Residue) -> FloatArray:
     """Return the φ/ψ map of a residue per block, `(n_blocks, n_bins)`."""
-    phi, psi = [x[:, residue.phi] for x in f.phi], [x[:, residue.psi] for x in f.psi]
-    return block_counts_joint(phi, psi, RAMACHANDRAN_BINS, blocks)
+    phi, psi = f.column("phi", residue.phi), f.column("psi", residue.psi)
+    return distributions.block_counts_joint(phi, psi, RAMACHANDRAN_BINS, blocks)
 
 
 def _map(inputs: ComparisonInput, residue: Residue, row: Row | None) -> Landscape:
@@ -201,7 +197,7 @@ def _single_torsion_rows(inputs: ComparisonInput) -> list[Row]:
         rows.append(_jsd_row(inputs, counts, "joint_jsd", what, residue.label))
     for symbol, key, labels in _phi_psi(inputs):
         for k, label in enumerate(labels):
-            counts, what = series_counts(inputs, _angle(inputs, key, k), TORSION_BINS), symbol
+            counts, what = series_counts(inputs, inputs.column(key, k), TORSION_BINS), symbol
             if key == "phi" and k in rare:
                 counts, what = [without_positive_phi(c, TORSION_BINS.n) for c in counts], f"{symbol} at φ < 0"
             rows.append(_jsd_row(inputs, counts, f"{key}_jsd", what, label))
@@ -217,7 +213,7 @@ def _mean_torsion_rows(inputs: ComparisonInput) -> list[Row]:
     for symbol, key, labels in _phi_psi(inputs):
         columns = evenly(range(len(labels)), MOST_HISTOGRAMS)
         if columns:
-            each = [series_counts(inputs, _angle(inputs, key, k), TORSION_BINS) for k in columns]
+            each = [series_counts(inputs, inputs.column(key, k), TORSION_BINS) for k in columns]
             counts = [np.stack(of_sample, axis=1) for of_sample in zip(*each, strict=True)]
             rows.append(_jsd_row(inputs, counts, f"{key}_jsd", symbol, f"mean of {len(columns)} residues"))
     return rows
@@ -262,7 +258,7 @@ def rare_residues(inputs: ComparisonInput) -> frozenset[int]:
     small share of their frames, and which any of the three visits at all."""
     found = []
     for k in range(len(inputs.torsions.phi_labels)):
-        reference, candidate, replicate = map(visits_of, _angle(inputs, "phi", k))
+        reference, candidate, replicate = map(visits_of, inputs.column("phi", k))
         source = reference + replicate
         small = source.inside < _SMALL_SHARE * source.n_frames
         if source.visits < _FEW_VISITS and small and source.visits + candidate.visits:
@@ -277,7 +273,7 @@ def free_energy_row(inputs: ComparisonInput, k: int, label: str) -> Row:
     of none the free energy is that of half a visit. The p-value is of the free energies, or of the visits if that is
     less (exact: which trajectory a visit falls into is a matter of their lengths), in either case doubled.
     """
-    found = list(map(visits_of, _angle(inputs, "phi", k)))
+    found = list(map(visits_of, inputs.column("phi", k)))
     reference, candidate, replicate = found
     of_all = reference + candidate + replicate
     length = of_all.inside / of_all.visits
@@ -336,14 +332,13 @@ def other_torsion_rows(inputs: ComparisonInput) -> Measured:
     rows: list[Row] = []
     charts: list[Chart] = []
     skipped: list[Skipped] = []
-    measured = inputs.families("torsions")
     for kind, name in _NAMES.items():
         chosen = [k for k, torsion in enumerate(probes.torsions) if torsion.kind == kind]
         if not chosen:
             skipped.append((name, "the scene has none"))
         elif kind in ("χ", "rotatable") and len(chosen) <= _MANY:
             for k in chosen:
-                series = [[x[:, k] for x in v] for v in measured]
+                series = inputs.column("torsions", k)
                 label, fold = probes.torsions[k].label, probes.torsions[k].fold
                 label += "" if fold == 1 else f" ({fold} equal positions folded: {fold} times the angle)"
                 key = f"torsion_jsd:{label}"
@@ -410,13 +405,13 @@ def within_rows(inputs: ComparisonInput) -> Measured:
         for residue in inputs.torsions.residues:
             metric = f"φ given ψ's basin, distance, {residue.label}"
             what = f"φ of {residue.label} within the basins of ψ is distributed"
-            phi, states = _angle(inputs, "phi", residue.phi), _basins(inputs, residue)
+            phi, states = inputs.column("phi", residue.phi), _basins(inputs, residue)
             rows.append(_conditional_row(inputs, [phi], states, f"phi_given_psi:{residue.label}", metric, what))
     elif len(turning) > 1:
         chosen = turning[:_MOST_TORSIONS]
         metric = f"{len(chosen)} rotatable torsions given the slowest motion, mean distance"
         what = "rotatable torsions within states of the slowest motion are distributed"
-        angles = [[[x[:, k] for x in v] for v in inputs.families("torsions")] for k in chosen]
+        angles = [inputs.column("torsions", k) for k in chosen]
         rows.append(_conditional_row(inputs, angles, slow_states(inputs), "torsions_given_slowest", metric, what))
     skipped = [("Torsions within the states of slower ones", "the three trajectories share none of them")]
     return Measured([row for row in rows if row is not None], skipped=skipped if None in rows else [])
@@ -429,7 +424,7 @@ def _basins(inputs: ComparisonInput, residue: Residue) -> States:
             np.where(distributions.is_positive(f), -1, distributions.is_alpha(p).astype(np.int64))
             for f, p in zip(phi, psi, strict=True)
         ]
-        for phi, psi in zip(_angle(inputs, "phi", residue.phi), _angle(inputs, "psi", residue.psi), strict=True)
+        for phi, psi in zip(inputs.column("phi", residue.phi), inputs.column("psi", residue.psi), strict=True)
     ]
 
 
