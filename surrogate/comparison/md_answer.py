@@ -115,7 +115,8 @@ class Answer:
         weighted = [s for s in self.states if not s.missing]
         if self.is_by_surrogate:
             use = "Use the surrogate's populations for now, not MD's."
-            what = f"For {len(weighted)} states, to about {100 * MODEL_ERROR:.0f} % (assumed); MD does not contradict them."
+            what = f"For {len(weighted)} states, to about {100 * MODEL_ERROR:.0f} % (assumed); "
+            what += "MD does not contradict them."
         elif not self.is_sure:
             use, what = "Do not use MD's populations yet.", f"They show which states there are: {len(self.states)}."
         else:
