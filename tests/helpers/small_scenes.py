@@ -52,6 +52,16 @@ def rotated(positions: np.ndarray, atoms: list[int], axis: tuple[int, int], angl
     return out
 
 
+def turn_frames(x: np.ndarray, i: int, j: int, atoms: list[int], angle: np.ndarray) -> None:
+    """Turn `atoms` of every frame `(n, n_atoms, 3)` about the axis i -> j by `angle` `(n,)`, in place (Rodrigues)."""
+    axis = x[:, j] - x[:, i]
+    axis /= np.linalg.norm(axis, axis=1, keepdims=True)
+    v = x[:, atoms] - x[:, j : j + 1]
+    k = axis[:, None]
+    c, s = np.cos(angle)[:, None, None], np.sin(angle)[:, None, None]
+    x[:, atoms] = v * c + np.cross(k, v) * s + k * (k * v).sum(-1, keepdims=True) * (1 - c) + x[:, j : j + 1]
+
+
 def beyond(scene: Scene, start: int, end: int) -> list[int]:
     """Atoms on the side of `end` of the bond from `start` to `end`."""
     from systems.chemistry.graph import bonded_graph

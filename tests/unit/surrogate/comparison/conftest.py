@@ -8,33 +8,15 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
+from small_scenes import beyond, turn_frames
 from surrogate.comparison.read.ensemble import Ensemble
 from systems.chemistry.geometry import torsion
-from systems.chemistry.graph import backbone_torsions, bonded_graph
+from systems.chemistry.graph import backbone_torsions
 from systems.scene import Scene
 
 # States: beta, alpha, left-handed. Rows sum to one; the slowest exchange takes some ten frames.
 TRANSITIONS = np.array([[0.88, 0.10, 0.02], [0.15, 0.83, 0.02], [0.06, 0.06, 0.88]])
 CENTRES_RAD = np.radians([[-75.0, 150.0], [-70.0, -20.0], [60.0, 40.0]])
-
-
-def downstream(scene: Scene, fixed: int, moving: int) -> np.ndarray:
-    """Atoms that turn when the bond fixed-moving is turned, `moving` included."""
-    import networkx as nx
-
-    graph = bonded_graph(scene).copy()
-    graph.remove_edge(fixed, moving)
-    return np.array(sorted(nx.node_connected_component(graph, moving)))
-
-
-def _turn(x: np.ndarray, i: int, j: int, atoms: np.ndarray, angle: np.ndarray) -> None:
-    """Rotate `atoms` of every frame about the axis i -> j by `angle` `(n,)`, in place (Rodrigues)."""
-    axis = x[:, j] - x[:, i]
-    axis /= np.linalg.norm(axis, axis=1, keepdims=True)
-    v = x[:, atoms] - x[:, j : j + 1]
-    k = axis[:, None]
-    c, s = np.cos(angle)[:, None, None], np.sin(angle)[:, None, None]
-    x[:, atoms] = v * c + np.cross(k, v) * s + k * (k * v).sum(-1, keepdims=True) * (1 - c) + x[:, j : j + 1]
 
 
 def pose(scene: Scene, phi: np.ndarray, psi: np.ndarray, rng: np.random.Generator) -> np.ndarray:
@@ -44,7 +26,7 @@ def pose(scene: Scene, phi: np.ndarray, psi: np.ndarray, rng: np.random.Generato
     for quad, target in ((quads["phi"][0], phi), (quads["psi"][0], psi)):
         _, i, j, _ = (int(a) for a in quad)
         start = float(torsion(scene.positions_nm[None], quad[None])[0, 0])
-        _turn(x, i, j, downstream(scene, i, j), target - start)
+        turn_frames(x, i, j, beyond(scene, i, j), target - start)
     return (x + 0.002 * rng.standard_normal(x.shape)).astype(np.float32)
 
 

@@ -203,24 +203,6 @@ def test_two_atoms_swapped_are_noticed(inputs: ComparisonInput, pair: tuple[str,
         assert found.row(f"valid:{validity.CHIRALITY}").verdict == "fails"
 
 
-def test_two_equal_hydrogens_swapped_are_not(inputs: ComparisonInput, fair: Evaluation) -> None:
-    """The hydrogens of a methyl group have no identity."""
-    found = evaluate(inputs, swapped(inputs, "ALA:HB1", "ALA:HB2"))
-    assert found.status == "indistinguishable", found.verdict
-    assert [r.verdict for r in found.rows] == [r.verdict for r in fair.rows]
-
-
-def test_fifty_kelvin_show_in_the_width_of_bonds(inputs: ComparisonInput, alanine_dipeptide: Scene) -> None:
-    """Noise of the candidate scaled as at 350 K: sqrt(350/300), 8 % wider; nothing else changes."""
-    frames = frames_of(inputs)
-    warm = frames + np.random.default_rng(5).normal(0, 0.002 * math.sqrt(50 / 300), frames.shape)
-    found = evaluate(inputs, warm)
-    row = found.row("bond_width")
-    assert row.candidate.value / row.reference.value == pytest.approx(math.sqrt(350 / 300), rel=0.01)  # type: ignore[union-attr]
-    assert row.verdict == "differs"
-    assert words(found, "kinetics") <= {"agrees", "undecided"}
-
-
 @pytest.mark.parametrize("factor", [0.5, 2.0])
 def test_a_wrong_time_axis_shows_in_the_relaxation_time(simulate: Callable[..., Ensemble], factor: float) -> None:
     longer = (simulate(71, 40_000), simulate(72, 40_000), simulate(73, 40_000))
@@ -231,11 +213,6 @@ def test_a_wrong_time_axis_shows_in_the_relaxation_time(simulate: Callable[..., 
     assert row.candidate.value == pytest.approx(factor * row.reference.value, rel=0.35)
     assert found.row("joint_jsd").verdict == "agrees"
     assert ("too slowly" if factor > 1 else "too fast") in found.verdict
-
-
-def test_repeated_frames_slow_it_down(inputs: ComparisonInput) -> None:
-    found = evaluate(inputs, np.repeat(frames_of(inputs), 2, axis=0))
-    assert found.row("correlation_time").verdict == "differs"
 
 
 def test_five_picometres_of_noise_widen_the_bonds(inputs: ComparisonInput) -> None:

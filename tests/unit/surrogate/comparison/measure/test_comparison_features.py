@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from small_scenes import beyond, rotated
 from surrogate.comparison.measure.structure import find_probes, find_rings, mean_structure, pucker
 from surrogate.comparison.measure.torsions import find_torsions
 from surrogate.comparison.read.ensemble import Ensemble, load_ensemble
-from systems.chemistry.graph import bonded_graph
 from systems.prepare.peptide import build_peptide
 from systems.scene import Scene
 
@@ -147,23 +147,6 @@ def test_it_does_not_matter_which_of_equal_atoms_is_called_the_first(peptide: Sc
 # ---- known answers -------------------------------------------------------------------------------------------------
 
 
-def turned(scene: Scene, i: int, j: int, degrees: float) -> np.ndarray:
-    """The scene's positions with everything beyond j turned about the bond i-j."""
-    import networkx as nx
-
-    graph = bonded_graph(scene).copy()
-    graph.remove_edge(i, j)
-    atoms = sorted(nx.node_connected_component(graph, j))
-    x = scene.positions_nm.copy()
-    axis = x[j] - x[i]
-    axis /= np.linalg.norm(axis)
-    v, angle = x[atoms] - x[j], np.radians(degrees)
-    x[atoms] = (
-        v * np.cos(angle) + np.cross(axis, v) * np.sin(angle) + np.outer(v @ axis, axis) * (1 - np.cos(angle)) + x[j]
-    )
-    return x
-
-
 @pytest.mark.parametrize(("bond", "fold"), [(("CB", "CG1"), 3), (("CB", "CG"), 2), (("CE", "NZ"), 3)])
 def test_equivalent_positions_are_one(peptide: Scene, bond: tuple[str, str], fold: int) -> None:
     """A methyl by 120°, a phenyl by 180°: the same molecule, the same number. Half of that is another one."""
@@ -174,7 +157,9 @@ def test_equivalent_positions_are_one(peptide: Scene, bond: tuple[str, str], fol
     i, j = k.quad[1:3]
 
     def value(degrees: float) -> float:
-        frame = turned(peptide, i, j, degrees)[None].astype(np.float32)
+        frame = rotated(peptide.positions_nm, beyond(peptide, i, j), (i, j), np.radians(degrees))[None].astype(
+            np.float32
+        )
         return float(probes.measure(frame)["torsions"][0, index])
 
     start = value(0.0)

@@ -1,4 +1,5 @@
-"""Autocorrelation, its integral and TICA against brute force and processes whose answers are known."""
+"""Autocorrelation, its integral, TICA and the Markov state model against brute force, processes of known answers, and
+deeptime."""
 
 from __future__ import annotations
 
@@ -8,8 +9,11 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
+from surrogate.comparison.comparison import compare
 from surrogate.comparison.measure import kinetics
 from surrogate.comparison.measure.statistics import Blocks, make_blocks
+from surrogate.comparison.read.ensemble import Ensemble
+from surrogate.comparison.rows.rows import Options
 
 
 def ar1(a: float, n: int, rng: np.random.Generator) -> np.ndarray:
@@ -140,3 +144,168 @@ def test_timescale_of_limits() -> None:
 
 def test_whole_blocks_are_segments() -> None:
     assert [p.block for p in Blocks.whole([3, 4]).pieces] == [0, 1]
+
+
+# Reversible: detailed balance with populations 0.6, 0.3, 0.1.
+CHAIN = np.array([[0.94, 0.05, 0.01], [0.10, 0.88, 0.02], [0.06, 0.06, 0.88]])
+POPULATIONS = np.array([0.6, 0.3, 0.1])
+
+
+def walk(n: int, rng: np.random.Generator) -> np.ndarray:
+    cumulative, out, state = CHAIN.cumsum(1), np.empty(n, dtype=np.int64), 0
+    for t, u in enumerate(rng.random(n)):
+        state = int(np.searchsorted(cumulative[state], u))
+        out[t] = state
+    return out
+
+
+def test_the_chain_is_what_it_is_said_to_be() -> None:
+    flux = POPULATIONS[:, None] * CHAIN
+    assert flux == pytest.approx(flux.T)
+    assert flux.sum(0) == pytest.approx(POPULATIONS)
+
+
+def test_exact_counts_give_the_exact_spectrum() -> None:
+    """Counts in proportion to the flux: eigenvalues to rounding, at this lag and at seven lags."""
+    for power in (1, 7):
+        flux = POPULATIONS[:, None] * np.linalg.matrix_power(CHAIN, power)
+        exact = np.sort(np.linalg.eigvals(CHAIN).real)[::-1][1:] ** power
+        values, functions = kinetics.slow_functions(1e6 * flux, 2)
+        assert values == pytest.approx(exact, abs=1e-12)
+        for value, function in zip(values, functions, strict=True):
+            sums = kinetics.function_sums(1e6 * flux.reshape(1, 9), function)
+            assert float(kinetics.lagged_eigenvalue(sums)) == pytest.approx(value, abs=1e-12)
+            assert POPULATIONS @ function == pytest.approx(0, abs=1e-12), "orthogonal to the constant"
+
+
+def test_counts_equal_deeptimes_and_cross_no_gap() -> None:
+    from deeptime.markov import TransitionCountEstimator
+
+    rng = np.random.default_rng(0)
+    labels = [walk(500, rng), walk(300, rng)]
+    labels[0][100] = -1
+    blocks = make_blocks([500, 300], 60)
+    ours = kinetics.block_transitions(labels, blocks, 3, 4).sum(0).reshape(3, 3)
+    brute = np.zeros((3, 3))
+    for series in labels:
+        for a, b in zip(series[:-4], series[4:]):
+            if a >= 0 and b >= 0:
+                brute[a, b] += 1
+    assert (ours == brute).all()
+    theirs = TransitionCountEstimator(lagtime=4, count_mode="sliding").fit([labels[1].astype(np.int32)]).fetch_model()
+    alone = kinetics.block_transitions([labels[1]], make_blocks([300], 60), 3, 4).sum(0).reshape(3, 3)
+    assert (alone == theirs.count_matrix).all()
+    occupancy = kinetics.state_counts(labels, blocks, 3).sum(0)
+    assert occupancy[3] == 1 and occupancy.sum() == 800
+
+
+def test_a_markov_chain_passes_chapman_kolmogorov_and_a_lumped_one_does_not() -> None:
+    """Negative control: three states in a row, of which the outer two are called one, remember where they came from."""
+    rng = np.random.default_rng(1)
+    labels = [walk(60_000, rng)]
+    blocks = make_blocks([60_000], 1000)
+
+    def gap(series: list[np.ndarray], n: int) -> float:
+        counts = [kinetics.block_transitions(series, blocks, n, 5 * i).sum(0).reshape(n, n) for i in range(1, 6)]
+        predicted, estimated = kinetics.chapman_kolmogorov(counts)
+        assert predicted[0] == pytest.approx(estimated[0])
+        return float(np.abs(predicted - estimated).max())
+
+    assert gap(labels, 3) < 0.03
+    slow_fast = np.where(labels[0] == 2, 1, np.arange(60_000) % 2)  # a state half of which is left at every step
+    assert gap([slow_fast], 2) > 0.1
+
+
+def test_model_of_a_chain_seen_through_noise() -> None:
+    """States are points in a plane with correlated noise: clustering and PCCA must find them, timescales be exact."""
+    rng = np.random.default_rng(2)
+    segments, hidden = [], []
+    for n in (30_000, 20_000):
+        state = walk(n, rng)
+        noise = lfilter([0.1], [1, -0.3], rng.standard_normal((n, 2)), axis=0)
+        segments.append(np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])[state] + noise)
+        hidden.append(state)
+    segments[0][77] = np.nan
+    projection = kinetics.fit_projection(segments, 2)
+    assert projection is not None
+    coordinates = [projection.project(x) for x in segments]
+    model = kinetics.fit_model(coordinates, 2)
+    assert model is not None and model.n_states == 3
+    exact = -1 / np.log(np.sort(np.linalg.eigvals(CHAIN).real)[::-1][1:])
+    assert model.timescales[:2] == pytest.approx(exact, rel=0.12)
+    macro = model.lump(model.assign(coordinates))
+    assert macro[0][77] == -1
+    ok = np.concatenate(macro) >= 0
+    assert (np.concatenate(macro)[ok] == np.concatenate(hidden)[ok]).mean() > 0.99, "states in order of population"
+    assert 0.5 * exact[0] < kinetics.timescale(projection.eigenvalues, 2)[0] < exact[0], (
+        "a linear function of noisy features can only decay faster"
+    )
+
+
+def test_what_does_not_move_has_no_model() -> None:
+    assert kinetics.fit_projection([np.ones((500, 4))], 5) is None
+
+
+QUICK = Options(peptide_recipe=False)
+
+
+def test_rows_pass_a_replicate_and_reject_a_wrong_time_axis(inputs: tuple[Ensemble, Ensemble, Ensemble]) -> None:
+    from dataclasses import replace
+
+    reference, candidate, replicate = inputs
+    shuffled = candidate.segments[0].copy()
+    np.random.default_rng(0).shuffle(shuffled)
+    fair, wrong = compare(
+        reference, [candidate, replace(candidate, segments=[shuffled])], replicate, options=QUICK
+    ).evaluations
+    for key in ("msm_jsd", "transition_jsd", "msm_timescale:1"):
+        assert fair.row(key).verdict in ("agrees", "undecided"), key
+    assert wrong.row("msm_jsd").verdict == "agrees"
+    assert wrong.row("transition_jsd").verdict == "differs"
+    assert wrong.row("msm_timescale:1").verdict == "differs"
+    titles = [getattr(chart, "title", "") for chart in fair.charts]
+    for title in ("TICA landscape", "Free energies of the metastable states", "Implied timescales"):
+        assert title in titles
+
+
+def phi_of(ensemble: Ensemble) -> np.ndarray:
+    from systems.chemistry.geometry import torsion
+    from systems.chemistry.graph import backbone_torsions
+
+    return torsion(ensemble.segments[0][:], backbone_torsions(ensemble.scene)["phi"])[:, 0]
+
+
+def test_a_process_into_a_state_that_is_never_held_is_not_timed(inputs: tuple[Ensemble, Ensemble, Ensemble]) -> None:
+    """The toy's left-handed state (phi > 0) is cut out of the candidate, or of the replicate."""
+    from dataclasses import replace
+
+    reference, candidate, replicate = inputs
+    options = replace(QUICK, tica_lag_ps=2.0)
+    keep = phi_of(candidate) < 0
+    keep[[np.argmin(keep), len(keep) - 1 - np.argmin(keep[::-1])]] = True  # two frames that stray are no visit
+    blind = replace(candidate, segments=[candidate.segments[0][:][keep]])
+    fair, wrong = compare(reference, [candidate, blind], replicate, options=options).evaluations
+    timed = {row.key for row in fair.rows if row.key.startswith("msm_timescale")}
+    assert len(timed) >= 2
+    assert not any(what.startswith("Implied timescale") for what, _ in fair.skipped)
+    left_out = [(what, why) for what, why in wrong.skipped if what.startswith("Implied timescale")]
+    kept = {row.key for row in wrong.rows if row.key.startswith("msm_timescale")}
+    assert len(left_out) + len(kept) == len(timed) and left_out and kept, (
+        "the process between the others is still timed"
+    )
+    assert "the candidate never stays in state" in left_out[0][1] and "φ 6" in left_out[0][1]
+    # What it lacks is not forgiven: the populations say so.
+    assert wrong.row("msm_jsd").verdict == "differs"
+
+    def drawn(evaluation, role: str) -> int:  # type: ignore[no-untyped-def]
+        chart = next(c for c in evaluation.charts if getattr(c, "title", "") == "Implied timescales")
+        assert ("never stays in state" in chart.caption) == (evaluation is not fair)
+        return sum(line.role == role for line in chart.lines)
+
+    assert drawn(wrong, "candidate") == len(timed) - 1 == drawn(fair, "candidate") - 1
+
+    lame = replace(replicate, segments=[replicate.segments[0][:][phi_of(replicate) < 0]])
+    (other,) = compare(reference, [candidate], lame, options=options).evaluations
+    gone = [row for row in other.rows if row.key.startswith("msm_timescale") and not np.isfinite(row.replicate.value)]
+    assert len(gone) == len(left_out) and all(np.isfinite(row.candidate.value) for row in gone)
+    assert all(row.verdict in ("agrees", "undecided") for row in gone)

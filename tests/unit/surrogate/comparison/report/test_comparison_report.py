@@ -1,4 +1,4 @@
-"""The report: offline, whole or absent, strict JSON, the verdict first."""
+"""The report: offline, whole or absent, strict JSON, the verdict first; and the figures for notebooks."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from surrogate.comparison.comparison import Comparison, compare
 from surrogate.comparison.measure.statistics import Estimate
 from surrogate.comparison.read.ensemble import Ensemble
 from surrogate.comparison.report import report
-from surrogate.comparison.report.figures import Album, Figure, albums
+from surrogate.comparison.report.figures import Album, Figure, albums, answer_overview, weighted_maps
 from surrogate.comparison.report.report import Foreword, side_by_side, to_markdown, write_report
 from surrogate.comparison.rows.charts import BarChart, Landscape, Line, LineChart
 from systems.errors import InputError, StorageError
@@ -309,3 +309,27 @@ def test_long_names_beside_bars_leave_room_for_the_bars() -> None:
         figures.draw_chart(chart, 300.0)
     assert seen[0] >= 0 and seen[1] > 0.4
     assert seen[2] < 0 or seen[3] < 0.4, "negative control: whole names do not fit"
+
+
+def test_a_comparison_draws_reference_replicate_and_candidates(inputs: tuple[Ensemble, Ensemble, Ensemble]) -> None:
+    reference, other, rolled = inputs
+    found = compare(reference, [rolled, other], other)
+    axes = found.plot().axes
+    titles = [a.get_title() for a in axes if a.get_title()]
+    label = titles[0].partition(", ")[2]
+    assert titles == [f"{name}, {label}" for name in ("reference", "replicate", rolled.label, other.label)]
+    images = [np.ma.filled(np.ma.asarray(a.images[0].get_array()), -1.0) for a in axes if a.get_title()]
+    assert not np.array_equal(images[0], images[2]) and np.array_equal(images[1], images[3]), (
+        "the replicate is evaluated too"
+    )
+
+
+def test_weights_shape_the_maps_of_the_answer() -> None:
+    deep, flat = np.full((36, 36), 30.0), np.zeros((36, 36))
+    deep[5, 7] = 0.0
+    one, other = weighted_maps({"ALA 2": deep, "GLY 3": flat})
+    assert "ALA 2" in one.caption and one.svg.startswith("<svg") and one.svg != other.svg
+
+
+def test_an_answer_without_states_is_an_empty_figure(simulate: Callable[..., Ensemble]) -> None:
+    assert len(answer_overview("methane", {}).axes) == 1

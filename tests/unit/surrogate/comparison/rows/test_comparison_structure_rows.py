@@ -8,15 +8,19 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from small_scenes import beyond
+from small_scenes import turn_frames as turn
+from surrogate.comparison.comparison import Evaluation, compare
+from surrogate.comparison.equivalent_time import EquivalentTime, equivalent_time_charts
 from surrogate.comparison.measure.statistics import make_blocks
-from surrogate.comparison.measure.structure import Baseline, Features, backbone
+from surrogate.comparison.measure.structure import Baseline, Features, _ends, backbone
 from surrogate.comparison.read.ensemble import Ensemble
+from surrogate.comparison.rows.charts import LineChart
 from surrogate.comparison.rows.rows import ComparisonInput, Options, Row, make_sample
 from surrogate.comparison.rows.structure_rows import angle_rows, contact_rows, hydrogen_bond_rows, shape_rows
 from surrogate.comparison.rows.torsion_rows import other_torsion_rows
 from surrogate.comparison.verdict import evaluated_rows
-from systems.chemistry.graph import backbone_torsions, bonded_graph
-from systems.scene import Scene
+from systems.chemistry.graph import backbone_torsions
 
 METRICS = (shape_rows, angle_rows, other_torsion_rows, contact_rows, hydrogen_bond_rows)
 OPTIONS = Options(n_bootstrap=100, n_permutations=2000)
@@ -61,23 +65,6 @@ def fair(evaluated: Comparison, ensembles: tuple[Ensemble, Ensemble, Ensemble]) 
 
 def frames_of(ensembles: tuple[Ensemble, Ensemble, Ensemble]) -> np.ndarray:
     return np.array(ensembles[1].segments[0][:], dtype=np.float64)
-
-
-def beyond(scene: Scene, fixed: int, moving: int) -> np.ndarray:
-    import networkx as nx
-
-    graph = bonded_graph(scene).copy()
-    graph.remove_edge(fixed, moving)
-    return np.array(sorted(nx.node_connected_component(graph, moving)))
-
-
-def turn(x: np.ndarray, i: int, j: int, atoms: np.ndarray, angle: np.ndarray) -> None:
-    axis = x[:, j] - x[:, i]
-    axis /= np.linalg.norm(axis, axis=1, keepdims=True)
-    v = x[:, atoms] - x[:, j : j + 1]
-    c, s = np.cos(angle)[:, None, None], np.sin(angle)[:, None, None]
-    k = axis[:, None]
-    x[:, atoms] = v * c + np.cross(k, v) * s + k * (k * v).sum(-1, keepdims=True) * (1 - c) + x[:, j : j + 1]
 
 
 def test_an_equally_good_trajectory_passes(fair: dict[str, Row]) -> None:
@@ -210,3 +197,54 @@ def test_hydrogen_bonds_that_are_never_formed_are_missed(ensembles: tuple[Ensemb
     wrong = rows(0.0)
     assert {r.verdict for r in wrong.values()} == {"differs"}
     assert wrong[key].candidate.value == 0.0 and "is formed 0 % of the time" in wrong[key].statement
+
+
+@pytest.fixture(scope="module")
+def along(simulate: Callable[..., Ensemble]) -> Evaluation:
+    three = [simulate(k, 900) for k in (81, 82, 83)]
+    return compare(three[0], [three[1]], three[2], options=Options(peptide_recipe=False)).evaluations[0]
+
+
+def test_torsions_and_rmsd_are_drawn_along_time(along: Evaluation) -> None:
+    charts = {c.title: c for c in along.charts if isinstance(c, LineChart)}
+    for title in ("RMSD along time", "φ of ALA 2 along time", "ψ of ALA 2 along time"):
+        lines = charts[title].lines
+        assert [line.name for line in lines] == ["reference", "candidate", "replicate"]
+        assert all(len(line.x) == len(line.y) == 300 for line in lines), "900 frames, every third"
+        assert charts[title].dots, "no stroke across the picture where an angle runs over the end of its range"
+    assert "fewer than 5 residues" in dict(along.skipped)["Secondary structure"]
+
+
+def test_ends_are_those_of_the_chain() -> None:
+    from systems.library.named_scenes import prepare
+
+    scene = prepare("sequence:ACE-LYS-ALA-ARG-NME")
+    ends = _ends(scene)
+    assert ends is not None and [scene.atom_names[i] for i in ends] == ["CA", "CA"]
+
+
+def test_a_long_side_chain_is_no_end_of_a_short_chain() -> None:
+    """Lysine between caps: longest along its side chain; its ends are the caps'. A drug has no side chains."""
+    from systems.library.named_scenes import prepare
+    from systems.prepare.peptide import build_peptide
+
+    scene = build_peptide("ACE-LYS-NME")
+    ends = _ends(scene)
+    assert ends is not None
+    assert {scene.residue_names[scene.residue_of_atom[i]] for i in ends} == {"ACE", "NME"}
+    assert _ends(prepare("smiles:CCCCCC")) is not None
+
+
+def test_both_ends_of_an_interval_share_a_unit() -> None:
+    errors = (1.0, 0.1)
+    equivalent_time = EquivalentTime(
+        "x", "distribution", "x", 3400.0, 380.0, None, "", 0.1, (80.0, 1e4), errors, errors, errors
+    )
+    assert equivalent_time.in_words() == "3.4 ns [0.38 ns, > 10 ns]"
+    assert replace(equivalent_time, high_ps=23_997.0).in_words() == "3.4 ns [0.38 ns, 24 ns]"
+    assert (
+        replace(equivalent_time, equivalent_ps=690.0, low_ps=41.0, high_ps=820.0).in_words() == "690 ps [41 ps, 820 ps]"
+    )
+    assert equivalent_time_charts([equivalent_time])[0].x_label == "length of MD / ns"
+    short = replace(equivalent_time, lengths_ps=(0.04, 5.0))
+    assert equivalent_time_charts([short])[0].x_label == "length of MD / ps", "no row of noughts below the axis"
