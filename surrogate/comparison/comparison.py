@@ -245,6 +245,7 @@ def compare(
     if not convergence.converged:
         remedy = convergence.remedy
         notes.append(f"The reference is {convergence.verdict} {remedy[:1].upper()}{remedy[1:]}.")
+    notes += _start_notes(measured[1 : 1 + n], baseline.torsions, options.seed)
     first, second = known[0], known[-1]
     if rep is None:
         half = first.n_frames // 2
@@ -284,6 +285,13 @@ def compare(
             for (features, _, e), evaluation in zip(own, evaluations, strict=True)
         ),
     )
+
+
+def _start_notes(candidates: Sequence[Features], torsions: Backbone, seed: int) -> list[str]:
+    """Return a line on each candidate of several replicas that still depends on where these started."""
+    several = [c for c in candidates if len(c.segment_lengths) > 1]
+    tested = [(c.label, convergence_of([c], torsions, seed=seed)) for c in several]
+    return [f"{label} itself is {found.verdict}" for label, found in tested if found.n_replicas and not found.converged]
 
 
 def _evaluate(

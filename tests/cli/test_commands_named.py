@@ -72,7 +72,11 @@ def problem(command: str, rest: str, root: Path) -> str | None:
         path = root / name
     if not path.is_file():
         return f"{path} does not exist"
-    known = {node.value for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, ast.Constant)}
+    tree = ast.parse(path.read_text())
+    # Studies of one folder may share their command line.
+    imported = [path.with_name(f"{n.module}.py") for n in ast.walk(tree) if isinstance(n, ast.ImportFrom)]
+    trees = [tree, *(ast.parse(p.read_text()) for p in imported if p.is_file())]
+    known = {node.value for t in trees for node in ast.walk(t) if isinstance(node, ast.Constant)}
     unknown = [flag for flag in _FLAG.findall(rest) if flag not in known]
     return f"{name} knows no {unknown[0]}" if unknown else None
 

@@ -43,7 +43,7 @@ def test_systems_shows_a_scene_with_its_protocols_or_its_own_settings(name: str,
 def test_plan_takes_the_protocol_and_says_so() -> None:
     assert "300 K" in json.loads(run("plan", "ethanol", "--json").stdout)["integrator"]
     told = json.loads(run("plan", "ethanol", "--protocol", "md17", "--json").stdout)
-    assert "500 K" in told["protocol"]
+    assert "500K" in told["protocol"]
     assert (told["force_field"], told["solvent"], told["constraints"]) == ("gaff2", "vacuum", "none")
     assert "0.5 fs" in told["integrator"]
     assert "500 K" in told["integrator"]

@@ -11,8 +11,7 @@ from integrator import IntegratorReport, angles, bonds, compare_integrator
 from torch import Tensor
 
 from surrogate.data import TrainingFrames, quantise
-from surrogate.models.baselines import Baseline, BaselineConfig
-from surrogate.models.propagator import Chunk, Molecule
+from surrogate.models.propagator import Chunk, Molecule, Propagator
 from systems.scene import Scene
 
 LAG_PS, STIFFNESS = 0.002, 20_000.0
@@ -31,16 +30,22 @@ def springs() -> Scene:
     )  # fmt: skip
 
 
-class ExactSprings(Baseline):
+class ExactSprings(Propagator):
     """The exact flow of independent harmonic wells; `heating` multiplies every chunk's last velocity."""
 
     arch: ClassVar[str] = "springs"
 
+    n_conditioning = 1
+    n_new = 5
+
     def __init__(self, scene: Scene, heating: float = 1.0) -> None:
-        super().__init__(BaselineConfig(n_new=5))
+        super().__init__()
         self.rest = torch.tensor(scene.positions_nm)
         self.omega = torch.from_numpy(np.sqrt(STIFFNESS / MASSES))[:, None]
         self.heating = heating
+
+    def noise_shape(self, n_atoms: int) -> tuple[int, ...]:
+        return (0,)
 
     def next_chunk(self, last_frames_nm: Tensor, molecule: Molecule, noise: Tensor, *, solver_steps: int = 1,
                    solver: str | None = None, last_velocities_nm_ps: Tensor | None = None) -> Chunk:  # fmt: skip

@@ -255,5 +255,5 @@ def test_a_complete_run_of_an_older_version_is_taken_for_one(alanine_dipeptide: 
     checkpoint_path(whole).write_bytes(b'{"config": {}, "n_frames": 3}\n...')
     with pytest.raises(InputError, match="is none of this version's"):
         simulate(alanine_dipeptide, replace(SHORT, time_ps=8.0), whole, resume=True)
-    with pytest.raises(TrajectoryError, match="earlier version"):
+    with pytest.raises(TrajectoryError, match="was not written by surromd"):
         open_writer(whole, alanine_dipeptide, {}, append=True)

@@ -323,7 +323,7 @@ def test_a_replaced_trajectory_is_refused(alanine_dipeptide: Scene, tmp_path: Pa
     out.write_bytes(mine)
     with open_writer(out, alanine_dipeptide, {}, append=True) as writer:
         writer.truncate(1)
-    with pytest.raises(InputError, match="holds 1 frames where its checkpoint has seen"):
+    with pytest.raises(InputError, match="holds 1 frames, its checkpoint has seen"):
         simulate(alanine_dipeptide, SHORT, out, resume=True)
     out.unlink()
     with pytest.raises(InputError, match="is not there to go on from"):

@@ -283,5 +283,5 @@ def test_files_hold_the_solute_whole_or_everything(tmp_path: Path, keep: str) ->
     with open_trajectory(outs[0]) as reader:
         assert reader.record["completed"] and reader.scene.n_atoms == n
         assert abs(reader.record["summary"]["temperature_k"]["mean"] - 300) < 40
-    with pytest.raises(UnknownNameError, match="solute, all, auto"):
+    with pytest.raises(UnknownNameError, match="auto, solute, all"):
         simulate_batch(scene, replace(config, keep="water"), [tmp_path / "no.h5"])

@@ -10,6 +10,7 @@ import pytest
 from compare_starts import SETTINGS, TORSIONS, Setting, evaluated, make_set
 
 from surrogate.comparison import convergence
+from surrogate.comparison.comparison import _start_notes
 from surrogate.comparison.convergence import convergence_of, explain
 from surrogate.comparison.measure.torsions import find_wells
 from surrogate.comparison.read.ensemble import load_ensemble
@@ -52,6 +53,13 @@ def test_two_halves_of_one_set_share_its_start_and_are_found() -> None:
     shares = [np.mean(np.concatenate(list(h.psi))[:, 0] > 1.0) for h in halves]
     assert abs(shares[0] - shares[1]) < 0.15
     assert not convergence_of(halves, TORSIONS).converged
+
+
+def test_a_candidate_that_depends_on_its_start_is_said_to() -> None:
+    one = Setting("one run", 1, 40.0)
+    sets = [make_set(setting, 4, label=setting.name) for setting in (LONG, DRIFTING, one)]
+    (said,) = _start_notes(sets, TORSIONS, seed=0)
+    assert said.startswith("one start itself is 32 replicas of 1.8 ns, not converged")
 
 
 def test_length_is_that_of_replicas_and_what_would_tell_is_longer_ones() -> None:
