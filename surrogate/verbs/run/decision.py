@@ -46,7 +46,7 @@ _EQUILIBRATION_SHARE = 0.1
 LEAST_TRAINING_S = 240.0
 # The report's share of a budget, and processor seconds that it takes at all, of an atom, and of an atom in a frame.
 _REPORT_SHARE, _READING_S = 0.15, (3.0, 0.055, 7e-7)
-_LEAST_FRAMES, _MOST_FRAMES = 4_000, 400_000
+_LEAST_FRAMES, _MOST_FRAMES = 20_000, 400_000
 _NICE = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000)
 
 
