@@ -345,7 +345,7 @@ def own_weights(md: Ensemble) -> Sequence[FloatArray] | None:
 
 def finished(place: Path) -> list[Path]:
     """Return the trajectories of a folder that are done."""
-    return [p for p in sorted(place.glob("*.h5")) if not checkpoint_path(p).exists()]
+    return [p for p in sorted(place.glob("[!.]*.h5")) if not checkpoint_path(p).exists()]
 
 
 def make_table(folder: Path, names: Sequence[str], out: Path | None, figure: Path | None) -> None:
