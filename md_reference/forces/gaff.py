@@ -186,8 +186,8 @@ def refuse(scene: Scene) -> None:
 
 
 def rough_parameters(scene: Scene) -> str:
-    """Return GAFF2 with Gasteiger's charges as AMBER prmtop text, in about a second and never kept: for states to ask
-    a better reference about. Raises PreparationError as `parameters`."""
+    """Return GAFF2 with Gasteiger's charges, which need no quantum mechanics, as AMBER prmtop text that is not cached:
+    for hot MD whose states a better method labels. Raises PreparationError as `parameters`."""
     refuse(scene)
     return _parametrise(scene, "gas").ordered_as(scene)
 

@@ -219,7 +219,7 @@ def refuse_trained_on(
 ) -> list[str]:
     """Raise InputError unless weights never saw these trajectories; return the fingerprints of their frames.
 
-    Refused are: frames that stand in the provenance of the weights, of those they began from and so on; a run of the
+    Refused are: frames named in the provenance of the weights, of those they began from and so on; a run of the
     same conditions and seed as one of these (a part of it, or saved otherwise); conditions other than those of
     training; an interval between the frames that are compared (`lag_ps`, or all) that the weights do not step to; and
     motion that reference and replicate have in common (`data.frames.refuse_leaks`).

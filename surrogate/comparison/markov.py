@@ -2,9 +2,8 @@
 
 Replicas that are shorter than the slowest relaxation remember where they began, so their plain averages are wrong; the
 transitions between states are not. A reversible maximum-likelihood Markov model turns transition counts into
-stationary populations, and these into a weight for every frame (Prinz et al., J. Chem. Phys. 134, 174105 (2011);
-deeptime: Hoffmann et al., Mach. Learn.: Sci. Technol. 3, 015009 (2022)). Nothing is invented: what transitions do not
-connect in both directions gets no weight and is named.
+stationary populations, and these into a weight for every frame (Prinz et al., J. Chem. Phys. 134, 174105 (2011)).
+Nothing is invented: what transitions do not connect in both directions gets no weight and is named.
 """
 
 from __future__ import annotations
@@ -221,7 +220,7 @@ def reversible(counts: FloatArray) -> tuple[FloatArray, FloatArray] | None:
 
     The flux is x_ij = (c_ij + c_ji) / (c_i / x_i + c_j / x_j) with x_i its sum over j (Prinz et al., equation 30), here
     by fixed-point iteration in log x, sped up by squared extrapolation (Varadhan and Roland, Scand. J. Stat. 35, 335
-    (2008)): some hundred times fewer steps than deeptime's where states are hardly connected.
+    (2008)): plain iteration, deeptime's, takes many more steps where states are hardly connected.
     """
     both, out = counts + counts.T, counts.sum(1)
 

@@ -167,7 +167,7 @@ class CrossAttentionBlock(nn.Module):
 
 # The blocks as rollouts evaluate them: the same functions and weights, laid out for speed on a CPU. In a profile of a
 # rollout more than half of the time went into what stands between the products. Here weights are packed once as the
-# processor multiplies them, halves of queries and keys stand beside each other as complex numbers, which turn by one
+# processor multiplies them, halves of queries and keys are paired as complex numbers, which turn by one
 # multiplication, and a modulation that all rows share is the affine part of the LayerNorm. Results differ from the
 # plain networks' by rounding alone.
 

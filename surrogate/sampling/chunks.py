@@ -404,7 +404,7 @@ class Interventions:
     ) -> Chunk:  # fmt: skip
         """Return the chunk number `chunk` after `last_nm (b, n_conditioning, n_atoms, 3)`, `step` frames into the run.
 
-        Tallies are brought up to date. Frames stand in it as they are to be written; where `failure` is set, the
+        Tallies are brought up to date. Frames are in it as they are to be written; where `failure` is set, the
         rollout must stop.
         """
         run = _Advance(self, last_nm, velocities_nm_ps, tallies, chunk, step)

@@ -2,7 +2,7 @@
 
     python docs/studies/preparation/charge_cost.py [--largest 90]
 
-Prints a row for each molecule and the law that stands in `md_reference/forces/gaff.py`.
+Prints a row for each molecule and the law given in `md_reference/forces/gaff.py`.
 Processor time of the children is counted, so that a busy machine changes little. Needs AmberTools; nothing is cached.
 """
 

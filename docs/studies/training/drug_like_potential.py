@@ -1,4 +1,4 @@
-"""One potential for drug-like molecules, trained on states of many that GFN2-xTB was asked about.
+"""One potential for drug-like molecules, trained on states of many molecules labelled by GFN2-xTB.
 
     python docs/studies/training/drug_like_potential.py train FOLDER -o OUT.safetensors --budget 6h [--resume]
     python docs/studies/training/drug_like_potential.py errors OUT.safetensors FOLDER

@@ -142,7 +142,7 @@ def read_list(path: Path = LIST) -> list[Entry]:
 
 
 def states_of(scene: Scene, smiles: str, n: int, seed: int) -> FloatArray:
-    """Return states `(n, n_atoms, 3)` nm of a molecule, before any of them is asked about."""
+    """Return states `(n, n_atoms, 3)` nm of a molecule, not yet labelled."""
     from rdkit import Chem
     from rdkit.Chem import AllChem
 

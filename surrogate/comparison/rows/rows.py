@@ -523,7 +523,7 @@ def shift_row(
 ) -> Row:
     """Return the row of the column whose mean is furthest off, from `means` of (reference, candidate, replicate).
 
-    `labels` name the columns, and the worst one's stands in the row's name. The p-value is the least over all columns
+    `labels` name the columns, and the worst one's is in the row's name. The p-value is the least over all columns
     times their number (Bonferroni). `statement(label, candidate, reference)` words the deviation.
     """
     ref, cand, rep = means

@@ -168,7 +168,7 @@ RING = (0.0, (180.0, 360.0))
 @dataclass(frozen=True, eq=False)
 class StatedTorsions:
     """The torsions of one peptide that have states: `quads` (n, 4) atoms; `residue` and `slot` (n,), where their states
-    stand in `(n_residues, MOST_TORSIONS)`; `first_deg` (n,), `edges_deg` (n, 2) as of PHI."""
+    are in `(n_residues, MOST_TORSIONS)`; `first_deg` (n,), `edges_deg` (n, 2) as of PHI."""
 
     quads: Tensor
     residue: Tensor

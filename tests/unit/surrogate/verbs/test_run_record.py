@@ -194,8 +194,8 @@ def test_where_md_is_too_short_to_do_better_the_surrogate_s_populations_are_the_
     assert short.to_dict()["populations_by"] == "surrogate" and answer().to_dict()["populations_by"] == "MD"
     for holds, surrogate, is_by in ((False, 0.3, False), (False, 0.19, True), (True, 0.19, False)):
         more = state(state="left-handed", share=0.01, error=0.05, surrogate=surrogate)
-        found_ = answer(holds=holds, states=(*vague, more))
-        assert found_.is_by_surrogate == is_by, "what MD contradicts is no answer"
+        short_or_sure = answer(holds=holds, states=(*vague, more))
+        assert short_or_sure.is_by_surrogate == is_by, "what MD contradicts is no answer"
     assert not answer(states=tuple(replace(s, surrogate_error=0.2) for s in vague)).is_by_surrogate, "nor what is vague"
     assert not answer(states=tuple(replace(s, surrogate=None) for s in vague)).is_by_surrogate
 
