@@ -1,18 +1,19 @@
 """Error of the final answer against minutes: `surromd run`, MD from one start, MD from many, a rollout alone.
 
-    python docs/studies/reference/error_against_minutes.py reference FOLDER [--time 30ns] [--replicas 32]
+    python docs/studies/reference/error_against_minutes.py reference FOLDER [--time 140ns]
     python docs/studies/reference/error_against_minutes.py runs FOLDER [--minutes 1 3 10]
     python docs/studies/reference/error_against_minutes.py rivals FOLDER [--minutes 10]
     python docs/studies/reference/error_against_minutes.py table FOLDER [-o TABLE.json] [--figure FIGURE.svg]
 
-`reference` makes FOLDER/NAME/run_000.h5 and on, SIMD replicas from many starts, frames 10 ps apart, a batch of every
-molecule before the next. `runs` spends each budget by `surromd run` in FOLDER/NAME/MINUTESmin, on the cores it may use:
-it alone needs a quiet machine (`taskset -c 0` for one core). `rivals` makes MD from one start (NAME/one) and a rollout
-(NAME/rollout) as long as the whole budget buys by the rates that the runs measured, reports and preparation for
-nothing. MD from many starts is a batch of the reference, beside the others. What is there is left alone, and what was
-stopped goes on. `table` lays all beside the reference: mean Jensen-Shannon distance of torsions (50 bins), root mean
-square error of the populations of states, how many 95 % intervals of populations, and of equivalent MD time, hold, and
-whether the verdict is right or "not converged".
+`reference` makes FOLDER/NAME/run_000.h5 and on, one batch of SIMD replicas from many starts, frames 10 ps apart, as
+long as its slowest process needs for a split R-hat below 1.05. `runs` spends each budget by `surromd run` in
+FOLDER/NAME/MINUTESmin, on the cores it may use: it alone needs a quiet machine (`taskset -c 0` for one core). `rivals`
+makes MD from one start (NAME/one) and a rollout (NAME/rollout) as long as the whole budget buys by the rates that the
+runs measured, reports and preparation for nothing. MD from many starts is the beginning of the reference, beside the
+rest of it. What is there is left alone, and what was stopped goes on. `table` lays all beside the reference: mean
+Jensen-Shannon distance of torsions (50 bins), root mean square error of the populations of states, how many 95 %
+intervals of populations, and of equivalent MD time, hold, and whether the verdict is right or "not converged". A
+molecule without a reference (chignolin folds in microseconds) has its verdict alone.
 """
 
 from __future__ import annotations
@@ -54,19 +55,20 @@ from systems.units import format_time_ps, parse_time_ps
 FloatArray = npt.NDArray[np.float64]
 Angles = dict[str, Sequence[FloatArray]]
 
+# What `prepare` takes, and the length of a replica of the reference in ns, 0 for none.
 MOLECULES = {
-    "THR-PHE": "sequence:ACE-THR-PHE-NME",
-    "GLN-ILE": "sequence:ACE-GLN-ILE-NME",
-    "TYR-ASP": "sequence:ACE-TYR-ASP-NME",
-    "TYR-THR-GLY": "sequence:ACE-TYR-THR-GLY-NME",
-    "ASN-ALA-LEU": "sequence:ACE-ASN-ALA-LEU-NME",
-    "free-GLY-VAL": "sequence:GLY-VAL",
-    "free-ALA-TYR": "sequence:ALA-TYR",
-    "VAL-SER-GLU-PHE": "sequence:ACE-VAL-SER-GLU-PHE-NME",
-    "lidocaine": "smiles:CCN(CC)CC(=O)Nc1c(C)cccc1C",
-    "clopidogrel": "smiles:COC(=O)[C@H](c1ccccc1Cl)N1CCc2sccc2C1",
-    "metoprolol": "smiles:COCCc1ccc(OC[C@@H](O)CNC(C)C)cc1",
-    "chignolin": "chignolin",
+    "THR-PHE": ("sequence:ACE-THR-PHE-NME", 140),
+    "GLN-ILE": ("sequence:ACE-GLN-ILE-NME", 30),
+    "TYR-ASP": ("sequence:ACE-TYR-ASP-NME", 100),
+    "TYR-THR-GLY": ("sequence:ACE-TYR-THR-GLY-NME", 60),
+    "ASN-ALA-LEU": ("sequence:ACE-ASN-ALA-LEU-NME", 100),
+    "free-GLY-VAL": ("sequence:GLY-VAL", 200),
+    "free-ALA-TYR": ("sequence:ALA-TYR", 120),
+    "VAL-SER-GLU-PHE": ("sequence:ACE-VAL-SER-GLU-PHE-NME", 60),
+    "lidocaine": ("smiles:CCN(CC)CC(=O)Nc1c(C)cccc1C", 500),
+    "clopidogrel": ("smiles:COC(=O)[C@H](c1ccccc1Cl)N1CCc2sccc2C1", 900),
+    "metoprolol": ("smiles:COCCc1ccc(OC[C@@H](O)CNC(C)C)cc1", 300),
+    "chignolin": ("chignolin", 0),
 }
 WAYS = {"run": "surromd run", "one": "MD from one start", "many": "MD from many starts", "rollout": "rollout alone"}
 HALVES = "reference's halves"
@@ -76,20 +78,19 @@ ENOUGH_R_HAT, HELD = 1.05, 0.95
 ROLLED_MINUTES = 1.0
 
 
-def make_reference(folder: Path, names: Sequence[str], time_ps: float, replicas: int) -> None:
-    """Make the reference of every molecule, batch by batch."""
-    size = n_replicas()
-    for first in range(0, replicas, size):
-        for name in names:
-            files = [folder / name / f"run_{k:03d}.h5" for k in range(first, first + size)]
-            files[0].parent.mkdir(parents=True, exist_ok=True)
-            scene = prepare(MOLECULES[name])
-            options = ReferenceOptions(
-                time_ps=time_ps, save_every_ps=EVERY_PS, seed=SEED + first, platform="simd", quiet=True
-            )
-            scene, config, _ = resolve_run(scene, options, {"time_ps": time_ps}, quiet=True)
-            simulate_replicas(scene, config, files, resume=True)
-            said(f"{name}: {first + size} replicas of {format_time_ps(time_ps)}")
+def make_reference(folder: Path, names: Sequence[str], time_ps: float | None) -> None:
+    """Make the reference of every molecule, by default as long as its slowest process needs."""
+    for name in names:
+        source, ns = MOLECULES[name]
+        if not ns:
+            continue
+        files = [folder / name / f"run_{k:03d}.h5" for k in range(n_replicas())]
+        files[0].parent.mkdir(parents=True, exist_ok=True)
+        length_ps = 1e3 * ns if time_ps is None else time_ps
+        options = ReferenceOptions(time_ps=length_ps, save_every_ps=EVERY_PS, seed=SEED, platform="simd", quiet=True)
+        scene, config, _ = resolve_run(prepare(source), options, {"time_ps": length_ps}, quiet=True)
+        simulate_replicas(scene, config, files, resume=True)
+        said(f"{name}: {len(files)} replicas of {format_time_ps(length_ps)}")
 
 
 def make_runs(folder: Path, names: Sequence[str], minutes: Sequence[float]) -> None:
@@ -101,7 +102,7 @@ def make_runs(folder: Path, names: Sequence[str], minutes: Sequence[float]) -> N
             if is_there and RunResult.of(out)["outcome"]:
                 continue
             try:
-                sm.run(MOLECULES[name], out, budget_s=60.0 * budget, quiet=True, resume=is_there)
+                sm.run(MOLECULES[name][0], out, budget_s=60.0 * budget, quiet=True, resume=is_there)
             except SurromdError as error:  # its line of the table stays empty, and the next time it goes on
                 said(f"{out}: {error}")
             said(f"{name}: {budget:g} min")
@@ -121,7 +122,7 @@ def make_rivals(folder: Path, names: Sequence[str], most_minutes: float) -> None
             time_ps=EVERY_PS * math.ceil(longest / EVERY_PS), save_every_ps=EVERY_PS, seed=SEED + 900, platform="simd",
             starts="one", quiet=True,
         )  # fmt: skip
-        scene, config, _ = resolve_run(prepare(MOLECULES[name]), options, {"time_ps": options.time_ps}, quiet=True)
+        scene, config, _ = resolve_run(prepare(MOLECULES[name][0]), options, {"time_ps": options.time_ps}, quiet=True)
         simulate_replicas(scene, config, [place / f"run_{k:03d}.h5" for k in range(n_replicas())], resume=True)
         rolls = rates[-1][0]["rolls"]
         if rolls:
@@ -131,7 +132,7 @@ def make_rivals(folder: Path, names: Sequence[str], most_minutes: float) -> None
             out = folder / name / "rollout" / "rolled.h5"
             out.parent.mkdir(exist_ok=True)
             sm.rollout(
-                MOLECULES[name], rolls["weights"], out, time_ps=time_ps, save_every_ps=every_ps,
+                MOLECULES[name][0], rolls["weights"], out, time_ps=time_ps, save_every_ps=every_ps,
                 replicas=rolls["replicas"], seed=SEED, resume=True, quiet=True,
             )  # fmt: skip
         said(f"{name}: rivals")
@@ -184,6 +185,14 @@ class LongMD:
         """Return other files of the molecule, or what is first in each."""
         found = load_ensemble(files, template=self.ensemble.scene)
         return found if first_ps is None else stretch(found, 0, max(2, round(first_ps / found.lag_ps)))
+
+    def errors_of_beginning(self, first_ps: float) -> tuple[float, float]:
+        """Return the errors of the first part of the reference's own replicas, beside the rest of it."""
+        own = self.load(self.files, first_ps)
+        n = max(0, len(own.segments[0]) - round(LEFT_OUT_PS / own.lag_ps))
+        rest = {k: [x[n:] for x in segments] for k, segments in self.angles.items()}
+        angles, weights = measured(self.baseline, own), own_weights(own)
+        return torsion_distance(rest, angles, weights), population_error(rest, angles, weights)
 
     def errors(self, of: Ensemble, weights: Sequence[FloatArray] | None = None) -> tuple[float, float]:
         """Return the distance of torsions, and the error of populations in per cent."""
@@ -294,9 +303,31 @@ def of_distribution(evaluated: dict[str, Any]) -> dict[str, Any] | None:
     return next((w for w in evaluated["equivalent_time"] if w["kind"] == "distribution"), None)
 
 
-def row(name: str, minutes: float, place: Path, ref: LongMD, batches: list[LongMD]) -> dict[str, Any]:
-    """Return a line of the table; a way that is not there has no error."""
+def row(name: str, minutes: float, place: Path, ref: LongMD | None) -> dict[str, Any]:
+    """Return a line of the table; a way that is not there has no error, and nothing is right without a reference."""
     result = RunResult.of(place / f"{minutes:g}min")
+    answer = result.answer
+    line: dict[str, Any] = {
+        "molecule": name, "minutes": minutes, "way": result["decision"]["way"],
+        "populations by": answer.get("populations_by", ""),
+        "stated": rounded(stated_error(answer)) if answer else None,
+        "verdict": "" if result["outcome"]["converged"] else "not converged",
+    }  # fmt: skip
+    if ref is None:
+        return line
+    found = errors_of_ways(result, minutes, place, ref)
+    for way, (distance_, populations) in found.items():
+        line |= {f"{way}: distance": rounded(distance_), f"{way}: populations": rounded(populations)}
+    held, total = intervals_held(answer, ref.answer)
+    line |= {"R-hat": rounded(ref.r_hat), HALVES: rounded(ref.replicate_baseline)}
+    line |= {"intervals held": held, "of": total, "equivalent MD time held": equivalent_time_held(result, ref)}
+    if result["outcome"]["converged"]:
+        line["verdict"] = "right" if held >= HELD * total - 1.0 else "wrong"
+    return line
+
+
+def errors_of_ways(result: RunResult, minutes: float, place: Path, ref: LongMD) -> dict[str, tuple[float, float]]:
+    """Return for each way that is there the distance of torsions and the error of populations in per cent."""
     rates = result["rates"]
     md_ps = md_length_ps(rates, minutes)
     found: dict[str, tuple[float, float]] = {}
@@ -307,28 +338,11 @@ def row(name: str, minutes: float, place: Path, ref: LongMD, batches: list[LongM
         found["run"] = ref.errors(ref.load(result.md), [sm.frame_weights(f) for f in result.md] if answer else None)
     if one := finished(place / "one"):
         found["one"] = ref.errors(ref.load(one, md_ps))
-    if len(batches) > 1:  # of the reference itself, beside the rest of it
-        own = batches[0].load(batches[1].files, md_ps)
-        found["many"] = batches[0].errors(own, own_weights(own))
+    if md_ps < 0.5 * ref.answer.replica_ps:
+        found["many"] = ref.errors_of_beginning(md_ps)
     if rates["rolls"] and (rolled := finished(place / "rollout")):
         found["rollout"] = ref.errors(ref.load(rolled, rolled_length_ps(rates, minutes)))
-    line: dict[str, Any] = {
-        "molecule": name, "minutes": minutes, "way": result["decision"]["way"],
-        "R-hat": rounded(ref.r_hat), HALVES: rounded(ref.replicate_baseline),
-    }  # fmt: skip
-    for way, (distance_, populations) in found.items():
-        line |= {f"{way}: distance": rounded(distance_), f"{way}: populations": rounded(populations)}
-    held, total = intervals_held(answer, ref.answer)
-    line |= {
-        "populations by": answer.get("populations_by", ""),
-        "stated": rounded(stated_error(answer)) if answer else None,
-    }
-    line |= {"intervals held": held, "of": total, "equivalent MD time held": equivalent_time_held(result, ref)}
-    if not result["outcome"]["converged"]:
-        line["verdict"] = "not converged"
-    else:
-        line["verdict"] = "right" if held >= HELD * total - 1.0 else "wrong"
-    return line
+    return found
 
 
 def rounded(value: float) -> float | None:
@@ -351,22 +365,18 @@ def finished(place: Path) -> list[Path]:
 def make_table(folder: Path, names: Sequence[str], out: Path | None, figure: Path | None) -> None:
     """Lay all runs beside the references, print and write the table and the figure."""
     rows = []
-    size = n_replicas()
     for name in names:
         files = finished(folder / name)
-        if len(files) < size or not budgets(folder / name):
-            continue
-        parts = [files[k : k + size] for k in range(0, len(files) - size + 1, size)]
-        ref = LongMD.of(files)
-        batches = [LongMD.of(part) for part in parts] if len(parts) > 1 else [ref]
-        warning = "" if ref.r_hat < ENOUGH_R_HAT else ", not converged itself"
-        length = f"{len(ref.files)} replicas of {format_time_ps(ref.answer.replica_ps)}"
-        said(f"{name}: {length}, split R-hat {ref.r_hat:.3f}{warning}")
+        ref = LongMD.of(files) if files else None
+        if ref is not None:
+            warning = "" if ref.r_hat < ENOUGH_R_HAT else ", not converged itself"
+            length = f"{len(ref.files)} replicas of {format_time_ps(ref.answer.replica_ps)}"
+            said(f"{name}: {length}, split R-hat {ref.r_hat:.3f}{warning}")
         for minutes in budgets(folder / name):
-            rows.append(row(name, minutes, folder / name, ref, batches))
+            rows.append(row(name, minutes, folder / name, ref))
             said("  " + ", ".join(f"{k} {v}" for k, v in rows[-1].items()))
     if not rows:
-        raise SystemExit(f"{folder} holds no reference of {size} replicas with runs beside it.")
+        raise SystemExit(f"{folder} holds no runs.")
     table = {
         "command": "python docs/studies/reference/error_against_minutes.py table FOLDER",
         "machine": f"{machine_name()}, one core used",
@@ -397,33 +407,32 @@ def cells(r: dict[str, Any]) -> list[str]:
         return "" if value is None else f"{value:.3g}"
 
     return [
-        f"{r['molecule']}, {r['minutes']:g}", f"{shown(r['R-hat'])}, {shown(r[HALVES])}",
-        *(shown(r.get(f"{way}: distance")) for way in WAYS), shown(r["run: populations"]), shown(r["stated"]),
-        r["populations by"], f"{r['intervals held']} of {r['of']}", r["verdict"],
+        f"{r['molecule']}, {r['minutes']:g}", f"{shown(r['R-hat'])}, {shown(r[HALVES])}" if "R-hat" in r else "none",
+        *(shown(r.get(f"{way}: distance")) for way in WAYS), shown(r.get("run: populations")), shown(r["stated"]),
+        r["populations by"], f"{r['intervals held']} of {r['of']}" if "of" in r else "", r["verdict"],
     ]  # fmt: skip
 
 
 def summary(rows: list[dict[str, Any]]) -> list[str]:
     """Return the study's answers, a line each."""
     found = []
-    full = [r for r in rows if "run: distance" in r and "one: distance" in r]
+    sure = [r for r in rows if r.get("R-hat", math.inf) < ENOUGH_R_HAT]
+    full = [r for r in sure if "one: distance" in r]
     if full:
         ratio = [r["run: distance"] / r["one: distance"] for r in full]
         best = [min(r[f"{w}: populations"] for w in WAYS if f"{w}: populations" in r) for r in full]
         near = [r["run: populations"] <= b + (r["stated"] or 0.0) for r, b in zip(full, best, strict=True)]
         found += [
-            f"error of the run over that of MD from one start: median {np.median(ratio):.2f} of {len(full)}",
+            f"with a reference of split R-hat below {ENOUGH_R_HAT}, error of the run over that of MD from one start: "
+            f"median {np.median(ratio):.2f} of {len(full)}",
             f"populations no worse than the best way's by more than the stated error: {sum(near)} of {len(full)}",
         ]
-    told = [r for r in rows if "verdict" in r]
     for word in ("right", "not converged", "wrong"):
-        found.append(f"verdict {word}: {sum(r['verdict'] == word for r in told)} of {len(told)}")
-    sure = [r for r in told if r["verdict"] != "not converged"]
-    held, total = (sum(r[key] for r in sure) for key in ("intervals held", "of"))
-    found.append(
-        f"intervals of populations that hold, of answers that are not told to be unconverged: {held} of {total}"
-    )
-    equivalent_times = [r["equivalent MD time held"] for r in told if r["equivalent MD time held"] is not None]
+        found.append(f"verdict {word}: {sum(r['verdict'] == word for r in rows)} of {len(rows)}")
+    answered = [r for r in sure if r["verdict"] != "not converged"]
+    held, total = (sum(r[key] for r in answered) for key in ("intervals held", "of"))
+    found.append(f"intervals of populations that hold, of converged answers: {held} of {total}")
+    equivalent_times = [r["equivalent MD time held"] for r in rows if r.get("equivalent MD time held") is not None]
     found.append(f"intervals of equivalent MD time that hold: {sum(equivalent_times)} of {len(equivalent_times)}")
     return found
 
@@ -448,7 +457,7 @@ def draw(rows: list[dict[str, Any]], out: Path) -> None:
         low, middle, high = (np.array([np.quantile(v, q) for _, v in points]) for q in (0.25, 0.5, 0.75))
         axes.plot(at, middle, "o-", color=f"C{k}", label=words)
         axes.fill_between(at, low, high, color=f"C{k}", alpha=0.15, linewidth=0)
-    replicate_baseline = float(np.median([r[HALVES] for r in rows]))
+    replicate_baseline = float(np.median([r[HALVES] for r in rows if HALVES in r]))
     axes.axhline(replicate_baseline, color="0.6", linestyle=":", label="two halves of the reference")
     axes.set(xscale="log", yscale="log", xlabel="budget / min", ylabel="mean distance of torsions to long MD")
     axes.set_xticks(minutes, [f"{m:g}" for m in minutes])
@@ -469,15 +478,14 @@ def main() -> None:
     for part in parts.values():
         part.add_argument("folder", type=Path)
         part.add_argument("--molecules", nargs="+", choices=sorted(MOLECULES), default=list(MOLECULES))
-    parts["reference"].add_argument("--time", type=lambda text: parse_time_ps(text, "--time"), default=30_000.0)
-    parts["reference"].add_argument("--replicas", type=int, default=32)
+    parts["reference"].add_argument("--time", type=lambda text: parse_time_ps(text, "--time"))
     parts["runs"].add_argument("--minutes", nargs="+", type=float, default=[1.0, 3.0, 10.0])
     parts["rivals"].add_argument("--minutes", type=float, default=10.0)
     parts["table"].add_argument("-o", "--out", type=Path)
     parts["table"].add_argument("--figure", type=Path)
     given = parser.parse_args()
     if given.verb == "reference":
-        make_reference(given.folder, given.molecules, given.time, given.replicas)
+        make_reference(given.folder, given.molecules, given.time)
     elif given.verb == "runs":
         make_runs(given.folder, given.molecules, given.minutes)
     elif given.verb == "rivals":
