@@ -22,7 +22,7 @@ from systems.errors import InputError, TrajectoryError, first_line
 from systems.files.schema import built, parsed
 from systems.files.whole_file import create_whole
 from systems.scene import Scene
-from systems.trajectory.base import open_hdf5
+from systems.trajectory.store import open_hdf5
 
 if TYPE_CHECKING:
     import h5py

@@ -74,7 +74,7 @@ def read_checkpoint(path: Path) -> Checkpoint:
         content = path.read_bytes()
         if not content.startswith(_MAGIC):
             raise ValueError("it is of another version of surromd, or no checkpoint")
-        header, blob, _ = unpacked(content[len(_MAGIC) :])  # earlier versions wrote the state before behind the last
+        header, blob = unpacked(content[len(_MAGIC) :])
         fitted(header, _Header, "header")
     except (OSError, ValueError) as error:
         raise InputError(f"checkpoint {path} cannot be read ({error}); start again with `overwrite=True`.") from error

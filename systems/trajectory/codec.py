@@ -17,25 +17,13 @@ import numpy.typing as npt
 
 from systems.errors import InputError, TrajectoryError
 from systems.files.whole_file import OutputLock, journal_path
-from systems.scene import PARTICLE, Scene
-from systems.trajectory.base import (
-    WEIGHTS,
-    Float32Array,
-    Float64Array,
-    FrameBlock,
-    FrameStore,
-    TrajectoryReader,
-    TrajectoryWriter,
-    check_same_topology,
-    open_hdf5,
-)
+from systems.scene import Scene
+from systems.trajectory.base import TrajectoryReader, TrajectoryWriter, check_same_topology
+from systems.trajectory.store import PER_ATOM, WEIGHTS, Float32Array, Float64Array, FrameStore, open_hdf5
 from systems.units import GAS_CONSTANT_KJ_MOL_K
-
-__all__ = ["FrameBlock", "TrajectoryReader", "TrajectoryWriter", "companions", "open_trajectory", "open_writer"]
 
 _HDF5 = (".h5", ".hdf5")
 _WITH_COMPANIONS = (".dcd", ".xtc")
-_COLUMNS = ("velocities", "forces")
 # What trajectories are written as.
 WRITTEN = (*_HDF5, *_WITH_COMPANIONS)
 
@@ -104,8 +92,8 @@ def refuse_columns(path: Path, columns: Sequence[str]) -> None:
         kind = path.suffix[1:].upper()
         raise InputError(f"{path}: {kind} files hold positions only; write an .h5 to keep {' and '.join(columns)}.")
     for name in columns:
-        if name not in _COLUMNS:
-            raise InputError(f"{path}: no column {name!r} can be stored; known: {', '.join(_COLUMNS)}.")
+        if name not in PER_ATOM:
+            raise InputError(f"{path}: no column {name!r} can be stored; known: {', '.join(PER_ATOM)}.")
 
 
 def companions(path: Path) -> tuple[Path, ...]:
@@ -139,10 +127,13 @@ def open_trajectory(path: str | Path, *, top: str | Path | None = None) -> Traje
     if suffix == ".dcd":
         return dcd_file.DcdReader(path, top)
     if suffix == ".xtc":
-        if companion_writer.is_ours(path):
+        if companion_writer.is_of_xtc(path):
             return companion_writer.XtcReader(path, top)
         pdb = companion_writer.topology_path(path)
         top = pdb if top is None and companion_writer.is_our_topology(pdb) else top
+        return foreign_readers.StreamReader(path, top)
+    if suffix in (".nc", ".ncdf", ".netcdf"):
+        return foreign_readers.StreamReader(path, top)
     if suffix == ".traj":
         return foreign_readers.AseReader(path, top)
     if path.name.lower().endswith(XYZ_SUFFIXES):
@@ -179,7 +170,7 @@ def join(paths: Sequence[Path], out: Path, *, overwrite: bool = False) -> Path:
         interval_ps = intervals[0] if intervals else float(stated) if isinstance(stated, int | float) else 1.0
         if any(abs(other - interval_ps) > 1e-6 * interval_ps for other in intervals):
             raise InputError(f"{out}: its replicas differ in the time between frames; join those of one interval.")
-        columns = [] if out.suffix.lower() in _WITH_COMPANIONS else list(_COLUMNS)
+        columns = [] if out.suffix.lower() in _WITH_COMPANIONS else list(PER_ATOM)
         columns = [c for c in columns if all(getattr(r, f"read_{c}")(0, 1) is not None for r in readers)]
         starts = np.cumsum([0, *(r.n_frames for r in readers)]).tolist()
         replicas = [
@@ -282,36 +273,17 @@ def to_mdanalysis(
     gaps = np.diff(times)
     if len(gaps) and not np.allclose(gaps, gaps[0], rtol=1e-6):
         raise InputError(f"frames between {times[0]:g} and {times[-1]:g} ps are unevenly spaced; take a range that is.")
-    chains = list(dict.fromkeys(scene.chain_of_residue))
-    universe = MDAnalysis.Universe.empty(
-        scene.n_atoms,
-        n_residues=len(scene.residue_names),
-        n_segments=len(chains),
-        atom_resindex=scene.residue_of_atom,
-        residue_segindex=[chains.index(c) for c in scene.chain_of_residue],
-        trajectory=False,
-    )
-    elements = ["" if e == PARTICLE else e for e in scene.elements]
-    attributes = {
-        "names": list(scene.atom_names), "types": elements, "elements": elements, "masses": scene.masses_da,
-        "formalcharges": scene.formal_charges, "resnames": list(scene.residue_names),
-        "resids": np.arange(1, len(scene.residue_names) + 1), "segids": chains,
-        # Of the file, a residue's place in the scene where it has none.
-        "resnums": [int("".join(filter(str.isdigit, text)) or k) for k, text in enumerate(scene.residue_ids, start=1)],
-    }  # fmt: skip
-    for name, values in attributes.items():
-        universe.add_TopologyAttr(name, values)
-    universe.add_TopologyAttr("bonds", [tuple(pair) for pair in scene.bonds.tolist()])
     dimensions = None
     if cells is not None:
         lengths, angles = lengths_and_angles(cells)
         dimensions = np.concatenate([lengths * 10.0, angles], axis=1).astype(np.float32)
-    step_ps = float(gaps[0]) if len(gaps) else 1.0
-    first_ps = float(times[0]) if len(times) else 0.0
-    universe.load_new(
-        positions * np.float32(10.0), format=MemoryReader, order="fac", dimensions=dimensions, dt=step_ps,
-        time_offset=first_ps,
+    universe = MDAnalysis.Universe(
+        scene.to_openmm_topology(), positions * np.float32(10.0), format=MemoryReader, order="fac",
+        dimensions=dimensions, dt=float(gaps[0]) if len(gaps) else 1.0,
+        time_offset=float(times[0]) if len(times) else 0.0,
     )  # fmt: skip
+    universe.atoms.masses = scene.masses_da
+    universe.add_TopologyAttr("formalcharges", scene.formal_charges)
     return universe
 
 

@@ -27,21 +27,20 @@ from systems.errors import InputError, SurromdError, TrajectoryError, first_line
 from systems.files.whole_file import create_whole, refuse_existing, storage_error, write_whole
 from systems.prepare.structure_text import encode, pdb_atom
 from systems.scene import Scene
-from systems.trajectory.base import (
+from systems.trajectory.base import TrajectoryReader, TrajectoryWriter
+from systems.trajectory.store import (
     CELLS,
     ENDS,
     FRAMES,
+    Columns,
     Float32Array,
     Float64Array,
     FrameBlock,
-    TrajectoryReader,
-    TrajectoryWriter,
     add_column,
     consistent_length,
     create_store,
     damage_reported,
     open_hdf5,
-    unused_top_note,
 )
 
 MOST_ATOMS = 99_999
@@ -94,25 +93,19 @@ def is_our_topology(pdb: Path) -> bool:
         return False
 
 
-def refuse_foreign_topology(trajectory: Path) -> None:
-    """Raise TrajectoryError where `NAME.pdb` of another program would be replaced."""
-    pdb = topology_path(trajectory)
-    if pdb.exists() and not is_our_topology(pdb):
-        raise TrajectoryError(
-            f"{pdb} is not ours and would be replaced by the topology of {trajectory.name}; choose another name for it."
-        )
-
-
 def topology_bytes(scene: Scene) -> bytes:
     """Return what `NAME.pdb` holds; nothing of a scene with more atoms than the format."""
     return pdb_text(scene).encode() if scene.n_atoms <= MOST_ATOMS else b""
 
 
-def refuse_other_topology(trajectory: Path, topology: bytes, *, overwrite: bool) -> None:
+def refuse_other_topology(trajectory: Path, topology: bytes = b"", *, overwrite: bool = True) -> None:
     """Raise TrajectoryError where `NAME.pdb` is another program's, or not `topology` and still needed: beside another
     trajectory of that name, or without `overwrite`."""
-    refuse_foreign_topology(trajectory)
     pdb = topology_path(trajectory)
+    if pdb.exists() and not is_our_topology(pdb):
+        raise TrajectoryError(
+            f"{pdb} is not ours and would be replaced by the topology of {trajectory.name}; choose another name for it."
+        )
     if not pdb.exists() or not topology or _atoms(pdb.read_bytes()) == _atoms(topology):
         return
     others = [trajectory.with_suffix(s) for s in _TRAJECTORIES if s != trajectory.suffix.lower()]
@@ -163,7 +156,7 @@ class CompanionWriter(TrajectoryWriter):
         super().__init__(path, self._meta, scene, record, append=append)
         try:
             self._fd = os.open(path, os.O_RDWR | getattr(os, "O_CLOEXEC", 0))
-            self._set_length(self.n_frames)
+            self._set_length(self.n_frames, self.file)
         except OSError as error:
             self.close()
             raise storage_error(path, error, "nothing was changed") from error
@@ -179,15 +172,7 @@ class CompanionWriter(TrajectoryWriter):
         refuse_other_topology(path, topology, overwrite=overwrite)
         made = [file for file in (self._meta, self._pdb, path) if not file.exists()]
         try:
-            create_store(
-                self._meta,
-                scene,
-                record,
-                self._lay_out,
-                overwrite=overwrite,
-                run_id=run_id,
-                checksums=(FRAMES,) if scene.cell_nm is None else (FRAMES, CELLS),
-            )
+            create_store(self._meta, scene, record, self._lay_out, overwrite=overwrite, run_id=run_id)
             write_topology(path, topology)
             create_whole(path, self._head(scene))
         except SurromdError:
@@ -205,35 +190,27 @@ class CompanionWriter(TrajectoryWriter):
         """Return what a file without frames holds."""
 
     @abstractmethod
-    def _encoded(self, block: FrameBlock) -> tuple[bytes, dict[str, npt.NDArray[Any]], dict[str, npt.NDArray[Any]]]:
+    def _encoded(self, block: FrameBlock) -> tuple[bytes, Columns, Columns]:
         """Return a block as the file has it, the columns that go with it, and what has a checksum (`FrameStore`).
 
         Raises InputError for frames that the format cannot hold.
         """
 
     @abstractmethod
-    def _offset(self, n_frames: int) -> int:
-        """Return where in the file the first `n_frames` frames end, bytes."""
+    def _offset(self, n_frames: int, record: h5py.File) -> int:
+        """Return where in the file the first `n_frames` frames end, bytes; `record`: the open `NAME.meta.h5`."""
 
-    def _restate(self, n_frames: int) -> None:
+    def _restate(self, n_frames: int, first_times_ps: Float64Array) -> None:
         """Make the header say so many frames, where there is one: one small write, which is atomic. Raises OSError."""
 
     def _append(self, block: FrameBlock) -> None:
         with self._open():
-            self._check_flags(block)
-        kind = self.path.suffix[1:].upper()
-        if block.velocities_nm_ps is not None or block.forces_kj_mol_nm is not None:
-            raise InputError(
-                f"{self.path}: {kind} files hold positions only; write an .h5 to keep velocities or forces."
-            )
-        if block.cell_nm is not None and self.scene.cell_nm is None:
-            raise InputError(f"{self.path}: {self.scene.name!r} has no periodic cell, but frames came with one.")
+            start = self._offset(self.n_frames, self.file)
+            times_ps = np.concatenate([self.file["time"][:2], block.time_ps])
         data, columns, stored = self._encoded(block)
         try:
-            start = self._offset(self.n_frames)
             write_whole(self._fd, data, start)
-            self._written(block, columns)
-            self._restate(self.n_frames + len(block))
+            self._restate(self.n_frames + len(block), times_ps)
             os.ftruncate(self._fd, start + len(data))
             os.fsync(self._fd)
             self._store(block, columns, stored)
@@ -242,34 +219,19 @@ class CompanionWriter(TrajectoryWriter):
             # The companion may hold these frames, where its own last step failed: what it lacks is cut off. Taking
             # space back needs none, so this also succeeds on a full disk; and frames too many do no harm.
             with suppress(OSError, SurromdError), open_hdf5(self._meta) as file:
-                n_frames = consistent_length(file, self._meta)
-                self._forgotten(n_frames)
-                self._set_length(n_frames)
+                self._set_length(consistent_length(file, self._meta), file)
             self.close()
             raise failed from error
 
-    def _cells(self, block: FrameBlock) -> Float64Array | None:
-        """The box vectors `(n, 3, 3)` nm of a block, the scene's own where it came without; None without a cell."""
-        if self.scene.cell_nm is None or block.cell_nm is not None:
-            return block.cell_nm
-        return np.broadcast_to(np.asarray(self.scene.cell_nm, dtype=np.float64), (len(block), 3, 3))
-
-    def _written(self, block: FrameBlock, columns: dict[str, npt.NDArray[Any]]) -> None:
-        """Remember what later frames depend on."""
-
-    def _forgotten(self, n_frames: int) -> None:
-        """Forget what is remembered of frames behind the first `n_frames`."""
-
-    def _set_length(self, n_frames: int) -> None:
+    def _set_length(self, n_frames: int, record: h5py.File) -> None:
         """Make header and file size say `n_frames`."""
-        self._restate(n_frames)
-        os.ftruncate(self._fd, self._offset(n_frames))
+        self._restate(n_frames, record["time"][: min(n_frames, 2)])
+        os.ftruncate(self._fd, self._offset(n_frames, record))
 
     def truncate(self, n_frames: int) -> None:
         super().truncate(n_frames)
-        self._forgotten(n_frames)
         try:
-            self._set_length(n_frames)
+            self._set_length(n_frames, self.file)
         except OSError as error:
             raise self.failed(error) from error
 
@@ -293,17 +255,30 @@ class CompanionReader(TrajectoryReader):
             ends: npt.NDArray[np.int64] = file[ENDS][: self.n_frames] if with_ends else np.empty(0, dtype=np.int64)
         assert self.scene is not None
         self.n_atoms = self.scene.n_atoms
-        if self._scene_of(top) is not None:
-            self.notes = (unused_top_note(top),)
+        if top is not None:
+            self.notes = (f"{top} is not used: the file holds its own topology.",)
         return ends
 
 
-def unfit_size(path: Path, what_is_there: str, recorded: str) -> TrajectoryError:
-    """Return the error for a file that does not hold the frames which its companion records."""
-    return TrajectoryError(
-        f"{path} holds {what_is_there} where {companions(path)[1].name} records {recorded}: one of them is cut short "
-        "or replaced; restore both from one copy."
-    )
+def is_of_xtc(path: Path) -> bool:
+    """Whether `NAME.meta.h5` beside a DCD or XTC is the record of an XTC. Raises TrajectoryError where it cannot be
+    read."""
+    meta = companions(path)[1]
+    if not meta.exists():
+        return False
+    with open_hdf5(meta) as file:
+        return ENDS in file
+
+
+def check_size(path: Path, n_frames: int, end: int, *, completed: bool) -> None:
+    """Raise TrajectoryError unless a file holds the recorded frames, which end at byte `end`; behind them a run may
+    have some in flight."""
+    size = path.stat().st_size
+    if size < end or (size > end and completed):
+        raise TrajectoryError(
+            f"{path} holds {size} bytes where {companions(path)[1].name} records {n_frames} frames of {end}: one of "
+            "them is cut short or replaced; restore both from one copy."
+        )
 
 
 # ---- XTC ------------------------------------------------------------------------------------------------------------
@@ -317,8 +292,6 @@ _DECODED_AT_ONCE = 4096
 class XtcWriter(CompanionWriter):
     """Writes an XTC and its companions; see `systems.trajectory.codec.open_writer` for the arguments and errors."""
 
-    _ends: npt.NDArray[np.int64]
-
     def _lay_out(self, file: h5py.File) -> None:
         add_column(file, "time", 0, "<f8")
         add_column(file, ENDS, 0, "<i8")
@@ -329,52 +302,36 @@ class XtcWriter(CompanionWriter):
     def _adopt(self) -> None:
         if ENDS not in self.file:
             raise TrajectoryError(f"{self._meta} is not the record of {self.path.name}; choose another name.")
-        self._ends = self.file[ENDS][: self.n_frames]
-        _check_size(self.path, self._ends, completed=False)
+        check_size(self.path, self.n_frames, self._offset(self.n_frames, self.file), completed=False)
 
-    def _offset(self, n_frames: int) -> int:
-        return int(self._ends[n_frames - 1]) if n_frames else 0
+    def _offset(self, n_frames: int, record: h5py.File) -> int:
+        return int(record[ENDS][n_frames - 1]) if n_frames else 0
 
-    def _encoded(self, block: FrameBlock) -> tuple[bytes, dict[str, npt.NDArray[Any]], dict[str, npt.NDArray[Any]]]:
+    def _encoded(self, block: FrameBlock) -> tuple[bytes, Columns, Columns]:
         beyond = ~(np.abs(block.positions_nm) < _MOST_NM).all(axis=(1, 2))
         if beyond.any():
             raise InputError(
                 f"{self.path}: frame {self.n_frames + int(np.argmax(beyond))} has positions that are not finite or too "
                 "large for an XTC; write an .h5."
             )
-        cells = self._cells(block)
-        data, sizes = _compressed(block.positions_nm, block.time_ps, self._steps(block.time_ps), cells)
+        data, sizes = _compressed(block, self._steps(block.time_ps, np.int32))
         # Checksums are of what a reader gets.
         positions, boxes = _decompressed(data, len(block), self.path, self.n_frames)
-        stored = {FRAMES: positions} if cells is None else {FRAMES: positions, CELLS: boxes}
-        return data, {ENDS: self._offset(self.n_frames) + np.cumsum(sizes)}, stored
-
-    def _steps(self, time_ps: Float64Array) -> npt.NDArray[np.int32]:
-        """Return the steps `(n,)` that go with times: of the integrator where the record states it, else frames."""
-        timestep = self.record.get("timestep_ps")
-        if isinstance(timestep, int | float) and timestep > 0 and time_ps[-1] / timestep < 2**31 - 1:
-            return np.rint(time_ps / timestep).astype(np.int32)
-        return np.arange(self.n_frames, self.n_frames + len(time_ps), dtype=np.int32)
-
-    def _written(self, block: FrameBlock, columns: dict[str, npt.NDArray[Any]]) -> None:
-        self._ends = np.concatenate([self._ends[: self.n_frames], columns[ENDS]])
-
-    def _forgotten(self, n_frames: int) -> None:
-        self._ends = self._ends[:n_frames]
+        stored: Columns = {FRAMES: positions} if block.cell_nm is None else {FRAMES: positions, CELLS: boxes}
+        return data, {ENDS: self._offset(self.n_frames, self.file) + np.cumsum(sizes)}, stored
 
 
 class XtcReader(CompanionReader):
     """Reads our XTC files with their companions; those of other programs MDTraj reads (`foreign_readers`).
 
-    Raises TrajectoryError when the file is cut short or damaged, InputError when `top` does not fit.
+    Raises TrajectoryError when the file is cut short or damaged.
     """
 
     def __init__(self, path: Path, top: Path | None) -> None:
         super().__init__(path)
         self._ends = self._read_companion(top, with_ends=True)
-        _check_size(path, self._ends, completed=self.record.get("completed") is True)
-        if self.scene is not None and not self.scene.positions_nm.any():
-            self.scene = self._at_first_frame(self.scene)
+        end = int(self._ends[-1]) if self.n_frames else 0
+        check_size(path, self.n_frames, end, completed=self.record.get("completed") is True)
 
     def _read(self, start: int, stop: int, stride: int) -> Float32Array:
         frames = np.concatenate([x[::stride] for x, _ in self._decoded(start, stop, stride)])
@@ -402,32 +359,14 @@ class XtcReader(CompanionReader):
                 yield _decompressed(data, last - first, self.path, first)
 
 
-def is_ours(path: Path) -> bool:
-    """Whether `NAME.meta.h5` beside an XTC is the record of it. Raises TrajectoryError where that cannot be read."""
-    meta = companions(path)[1]
-    if not meta.exists():
-        return False
-    with open_hdf5(meta) as file:
-        return ENDS in file
-
-
-def _check_size(path: Path, ends: npt.NDArray[np.int64], *, completed: bool) -> None:
-    """Raise TrajectoryError unless the XTC holds the recorded frames; behind them a run may have some in flight."""
-    end, size = (int(ends[-1]) if len(ends) else 0), path.stat().st_size
-    if size < end or (size > end and completed):
-        raise unfit_size(path, f"{size} bytes", f"{len(ends)} frames of {end}")
-
-
-def _compressed(
-    positions_nm: Float32Array, time_ps: Float64Array, steps: npt.NDArray[np.int32], cells_nm: npt.ArrayLike | None
-) -> tuple[bytes, npt.NDArray[np.int64]]:
+def _compressed(block: FrameBlock, steps: npt.NDArray[np.int32]) -> tuple[bytes, npt.NDArray[np.int64]]:
     """Return frames as an XTC file has them, and the size of each, bytes."""
     from mdtraj.formats import XTCTrajectoryFile
 
-    boxes = None if cells_nm is None else np.ascontiguousarray(cells_nm, dtype=np.float32)
+    boxes = None if block.cell_nm is None else np.ascontiguousarray(block.cell_nm, dtype=np.float32)
     with _scratch() as path:
         with XTCTrajectoryFile(str(path), "w") as file:
-            file.write(np.ascontiguousarray(positions_nm), time=time_ps.astype(np.float32), step=steps, box=boxes)
+            file.write(block.positions_nm, time=block.time_ps.astype(np.float32), step=steps, box=boxes)
         data = path.read_bytes()
         with XTCTrajectoryFile(str(path)) as file:
             starts = np.asarray(file.offsets, dtype=np.int64)

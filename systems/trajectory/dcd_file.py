@@ -25,13 +25,23 @@ from systems.chemistry.distance_bonds import lengths_and_angles, read_cells
 from systems.errors import TrajectoryError
 from systems.files.whole_file import write_whole
 from systems.scene import Scene
-from systems.trajectory.base import CELLS, ENDS, FRAMES, Float32Array, Float64Array, FrameBlock, add_column, open_hdf5
 from systems.trajectory.companion_writer import (
     CompanionReader,
     CompanionWriter,
+    check_size,
     companions,
+    is_of_xtc,
     is_our_topology,
-    unfit_size,
+)
+from systems.trajectory.store import (
+    CELLS,
+    ENDS,
+    FRAMES,
+    Columns,
+    Float32Array,
+    Float64Array,
+    FrameBlock,
+    add_column,
 )
 
 AKMA_PS = 4.888821e-2  # the value MDAnalysis and OpenMM use for CHARMM's unit of time
@@ -65,10 +75,6 @@ class DcdLayout:
     states_time: bool = True
     charmm_version: int = 24
     notes: tuple[str, ...] = ()
-
-    def is_ours(self, n_atoms: int, *, has_cell: bool) -> bool:
-        """Whether frames lie as we write them."""
-        return (self.n_atoms, self.byte_order, self.has_cell) == (n_atoms, "<", has_cell)
 
     @staticmethod
     def read(path: Path) -> DcdLayout:
@@ -238,7 +244,6 @@ class DcdWriter(CompanionWriter):
     """Writes a DCD and its companions; see `systems.trajectory.codec.open_writer` for the arguments and errors."""
 
     _layout: DcdLayout
-    _first_times: Float64Array
 
     def _lay_out(self, file: h5py.File) -> None:
         add_column(file, "time", 0, "<f8")
@@ -247,66 +252,60 @@ class DcdWriter(CompanionWriter):
         return header_bytes(0, 0, 1, 0.0, has_cell=scene.cell_nm is not None) + title_bytes(scene.n_atoms)
 
     def _adopt(self) -> None:
-        layout = DcdLayout.read(self.path)
-        is_ours = layout.is_ours(self.scene.n_atoms, has_cell=self.scene.cell_nm is not None)
-        if not is_ours or ENDS in self.file:
+        self._layout = layout = DcdLayout.read(self.path)
+        ours = (self.scene.n_atoms, "<", self.scene.cell_nm is not None)
+        if (layout.n_atoms, layout.byte_order, layout.has_cell) != ours or ENDS in self.file:
             raise TrajectoryError(f"{self.path} was not written by surromd and cannot be continued; take another name.")
-        _check_against_meta(self.path, layout, self.n_frames, completed=False)
-        self._layout, self._first_times = layout, self.first_times_ps()
+        check_size(self.path, self.n_frames, layout.offset(self.n_frames), completed=False)
 
-    def _offset(self, n_frames: int) -> int:
+    def _offset(self, n_frames: int, record: h5py.File) -> int:
         return self._layout.offset(n_frames)
 
-    def _encoded(self, block: FrameBlock) -> tuple[bytes, dict[str, npt.NDArray[Any]], dict[str, npt.NDArray[Any]]]:
+    def _encoded(self, block: FrameBlock) -> tuple[bytes, Columns, Columns]:
         frames = np.empty(len(block), dtype=self._layout.frame_dtype)
         angstrom = block.positions_nm * np.float32(10.0)
-        stored: dict[str, npt.NDArray[Any]] = {FRAMES: angstrom}
+        stored: Columns = {FRAMES: angstrom}
         for axis in range(3):
             frames[f"before{axis}"] = frames[f"after{axis}"] = 4 * self.scene.n_atoms
             frames[f"x{axis}"] = angstrom[:, :, axis]
-        if (cells := self._cells(block)) is not None:
-            stored[CELLS] = frames["cell"] = cell_blocks(cells)
+        if block.cell_nm is not None:
+            stored[CELLS] = frames["cell"] = cell_blocks(block.cell_nm)
         return frames.tobytes(), {}, stored
 
-    def _restate(self, n_frames: int) -> None:
-        first, nsavc, timestep_ps = 0, 1, 0.0
-        if len(self._first_times):
-            first, nsavc, timestep_ps = step_fields(self._first_times, self.record)
-        write_whole(self._fd, header_bytes(n_frames, first, nsavc, timestep_ps, has_cell=self._layout.has_cell), 0)
-
-    def _written(self, block: FrameBlock, columns: dict[str, npt.NDArray[Any]]) -> None:
-        self._first_times = np.concatenate([self._first_times, block.time_ps])[:2]
-
-    def _forgotten(self, n_frames: int) -> None:
-        self._first_times = self._first_times[:n_frames]
+    def _restate(self, n_frames: int, first_times_ps: Float64Array) -> None:
+        step = step_fields(first_times_ps, self.record) if len(first_times_ps) else (0, 1, 0.0)
+        write_whole(self._fd, header_bytes(n_frames, *step, has_cell=self._layout.has_cell), 0)
 
 
 class DcdReader(CompanionReader):
     """Reads our DCD files with their companions, and plain ones (32-bit, no fixed atoms) of other programs.
 
     Without companions times come from the header (1 ps a frame where it states no time step) and `scene` from `top`.
-    Raises TrajectoryError when the file is cut short or damaged, InputError when `top` does not fit.
+    Raises TrajectoryError when the file is cut short or damaged, InputError where `top` is needed and does not fit.
     """
 
     def __init__(self, path: Path, top: Path | None) -> None:
         super().__init__(path)
         self._layout = layout = DcdLayout.read(path)
         pdb, meta = companions(path)
-        if meta.exists() and not _is_of_xtc(meta):
+        if meta.exists() and not is_of_xtc(path):
             self._read_companion(top, with_ends=False)
-            _check_against_meta(path, layout, self.n_frames, completed=self.record.get("completed") is True)
+            completed = self.record.get("completed") is True
+            check_size(path, self.n_frames, layout.offset(self.n_frames), completed=completed)
             if self.n_atoms != layout.n_atoms:
                 raise TrajectoryError(f"{path} holds {layout.n_atoms} atoms a frame, its record {self.n_atoms}.")
         else:
             self.n_atoms, self.n_frames = layout.n_atoms, layout.whole_frames()
             self.time_ps, self.times_known = layout.times_ps(self.n_frames), layout.states_time
             self.notes = layout.notes
-            self.scene = self._scene_of(top or (pdb if is_our_topology(pdb) else None))
+            top = top or (pdb if is_our_topology(pdb) else None)
         self._frames: npt.NDArray[Any] = np.empty(0, dtype=layout.frame_dtype)
         if self.n_frames:
             self._frames = np.memmap(path, layout.frame_dtype, "r", layout.first_frame_at, (self.n_frames,))
-            if self.scene is not None and not self.scene.positions_nm.any():
-                self.scene = self._at_first_frame(self.scene)
+        if self.scene is None and (stated := self._scene_of(top)) is not None:
+            self._take_scene(stated, top)
+            if stated.positions_nm.any():  # a PSF has none
+                self.scene = stated
 
     def _read(self, start: int, stop: int, stride: int) -> Float32Array:
         frames = self._frames[start:stop:stride]
@@ -336,16 +335,3 @@ class DcdReader(CompanionReader):
     def close(self) -> None:
         super().close()
         self._frames = np.empty(0)  # gives the file's pages back
-
-
-def _is_of_xtc(meta: Path) -> bool:
-    with open_hdf5(meta) as file:
-        return ENDS in file
-
-
-def _check_against_meta(path: Path, layout: DcdLayout, n_frames: int, *, completed: bool) -> None:
-    """Raise TrajectoryError unless the DCD holds the recorded frames; behind them a run may have some in flight."""
-    extra = layout.file_bytes - layout.offset(n_frames)
-    if extra < 0 or (extra and completed):
-        whole = (layout.file_bytes - layout.first_frame_at) // layout.frame_dtype.itemsize
-        raise unfit_size(path, f"{whole} whole frames", str(n_frames))

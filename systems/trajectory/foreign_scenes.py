@@ -20,9 +20,8 @@ from systems.chemistry.bond_orders import ValenceError, perceive
 from systems.chemistry.distance_bonds import with_bonds_by_distance
 from systems.chemistry.element_data import atomic_weight_da, element_symbol
 from systems.errors import InputError, TrajectoryError, first_line
-from systems.files.schema import parsed
 from systems.prepare.structure_text import read_structure
-from systems.scene import Scene
+from systems.scene import IntArray, Scene
 
 _NM = {"nanometer": 1.0, "nm": 1.0, "angstrom": 0.1, "a": 0.1, "å": 0.1, "bohr": 0.0529177210903, "pm": 1e-3}
 _PS = {"picosecond": 1.0, "ps": 1.0, "femtosecond": 1e-3, "fs": 1e-3, "nanosecond": 1e3, "ns": 1e3, "microsecond": 1e6,
@@ -55,8 +54,8 @@ class Format:
     """One format, as the manual's table has it (docs/files.md), which also says what its library makes up.
 
     `times`, `positions`: EVERY, SOME or NONE, as files state them. `names_atoms`: whether it needs no `top`.
-    `unit_taken`: the unit that is taken, with a line, where nothing states one. `streamed`: read block by block. `mda`:
-    MDAnalysis' name of it, where the suffix does not say.
+    `unit_taken`: the unit that is taken, with a line, where nothing states one. `mda`: MDAnalysis' name of it, where
+    the suffix does not say.
     """
 
     name: str
@@ -66,7 +65,6 @@ class Format:
     names_atoms: bool
     positions: str = EVERY
     unit_taken: str = ""
-    streamed: bool = False
     mda: str | None = None
 
 
@@ -76,9 +74,9 @@ FORMATS = (
     Format("DCD", (".dcd",), "surromd", SOME, False),
     Format("XYZ, extended XYZ", XYZ_SUFFIXES, "surromd", NONE, True),
     Format("ASE", (".traj",), "ase", NONE, True),
-    Format("XTC", (".xtc",), "MDTraj", EVERY, False, streamed=True),
-    Format("TRR", (".trr",), "MDTraj", EVERY, False, positions=SOME, streamed=True),
-    Format("NetCDF (Amber)", (".nc", ".ncdf", ".netcdf"), "MDTraj", SOME, False, streamed=True),
+    Format("XTC", (".xtc",), "MDTraj", EVERY, False),
+    Format("TRR", (".trr",), "MDAnalysis", EVERY, False, positions=SOME),
+    Format("NetCDF (Amber)", (".nc", ".ncdf", ".netcdf"), "MDTraj", SOME, False),
     Format("PDB", (".pdb", ".pdb.gz"), "MDTraj", NONE, True),
     Format("PDBx/mmCIF", (".pdbx", ".cif", ".mmcif", ".pdbx.gz", ".cif.gz", ".mmcif.gz"), "MDTraj", NONE, True),
     Format("GRO", (".gro",), "MDTraj", SOME, True),
@@ -168,28 +166,15 @@ def scene_from_mdtraj_topology(
     )
 
 
-def scene_from_topology_json(text: bytes | str, positions_nm: npt.ArrayLike, path: Path) -> Scene:
-    """Return the Scene of an MDTraj HDF5 file's topology JSON. Raises TrajectoryError when it is damaged."""
-    import mdtraj
-    from mdtraj.core import element
-    from mdtraj.core.topology import bond_name_to_type
+def scene_of_mdtraj_hdf5(path: Path, positions_nm: npt.ArrayLike) -> Scene:
+    """Return the Scene of MDTraj's topology in an HDF5 file. Raises TrajectoryError when it is damaged."""
+    from mdtraj.formats import HDF5TrajectoryFile
 
     try:
-        record = parsed(text)
-        topology = mdtraj.Topology()
-        for chain_record in sorted(record["chains"], key=lambda c: c["index"]):
-            chain = topology.add_chain(chain_record.get("chain_id"))
-            for entry in sorted(chain_record["residues"], key=lambda r: r["index"]):
-                residue = topology.add_residue(entry["name"], chain, resSeq=entry.get("resSeq", entry["index"] + 1))
-                for atom in sorted(entry["atoms"], key=lambda a: a["index"]):
-                    symbol = atom["element"]
-                    kind = element.get_by_symbol(symbol) if symbol else element.virtual
-                    topology.add_atom(atom["name"], kind, residue, formal_charge=atom.get("formal_charge"))
-        atoms = list(topology.atoms)
-        metadata = record.get("bond_metadata") or [{"order": None, "type": None}] * len(record["bonds"])
-        for (i, j), bond in zip(record["bonds"], metadata, strict=True):
-            topology.add_bond(atoms[i], atoms[j], order=bond["order"], type=bond_name_to_type(bond["type"]))
-    except (KeyError, ValueError, TypeError, IndexError) as error:
+        with warnings.catch_warnings(), HDF5TrajectoryFile(str(path)) as file:
+            warnings.simplefilter("ignore")  # a topology may number no residues
+            topology = file.topology
+    except Exception as error:  # PyTables and MDTraj raise their own kinds
         raise TrajectoryError(f"{path} is damaged: its /topology cannot be understood ({error}).") from error
     return scene_from_mdtraj_topology(topology, positions_nm, name=path.stem, source=path.name)
 
@@ -262,26 +247,13 @@ def scene_from_universe(top: Path, *, name: str) -> Scene:
     bonds = np.empty((0, 2), dtype=np.int64)
     if hasattr(atoms, "bonds"):
         bonds = np.unique(np.sort(np.asarray(atoms.bonds.to_indices()).reshape(-1, 2), axis=1), axis=0).astype(np.int64)
-    scene = Scene(
-        name=name,
-        atom_names=tuple(names),
-        elements=tuple(elements),
-        residue_of_atom=of_atom,
-        residue_names=tuple(residues),
-        residue_ids=tuple(str(x) for x in _values(atoms.residues, "resids", range(1, len(residues) + 1))),
-        chain_of_residue=("A",) * len(residues),
-        bonds=bonds,
-        bond_orders=np.zeros(len(bonds)),
-        formal_charges=np.zeros(len(elements), dtype=np.int64),
-        masses_da=np.array([atomic_weight_da(e) for e in elements]),
-        positions_nm=positions,
-        provenance={"source": top.name},
-    )
-    return with_orders(with_bonds_by_distance(scene))
+    ids = [str(x) for x in _values(atoms.residues, "resids", range(1, len(residues) + 1))]
+    scene = _scene_of_names(top, names, elements, positions, of_atom, residues, ids, bonds)
+    return with_orders(with_bonds_by_distance(replace(scene, name=name)))
 
 
 def is_mdtraj_format(path: Path) -> bool:
-    """Whether MDTraj has a reader for files of this suffix that needs no topology of the caller's beyond `top`."""
+    """Whether MDTraj has a reader for files of this suffix."""
     from mdtraj.formats.registry import FormatRegistry
 
     if format_of(path) is not OTHER:
@@ -298,23 +270,37 @@ def named_scene(
 ) -> Scene:
     """Return the Scene of atoms that a file only names, one residue; bonds by distance, across the cell `(3, 3)` nm
     too, orders by valence."""
-    n = len(elements)
-    scene = Scene(
+    one, no_bonds = np.zeros(len(elements), dtype=np.int64), np.empty((0, 2), dtype=np.int64)
+    scene = _scene_of_names(path, names, elements, positions_nm, one, ["MOL"], ["1"], no_bonds)
+    return with_orders(with_bonds_by_distance(scene, cell_nm))
+
+
+def _scene_of_names(
+    path: Path,
+    names: Sequence[str],
+    elements: Sequence[str],
+    positions_nm: npt.ArrayLike,
+    residue_of_atom: IntArray,
+    residue_names: Sequence[str],
+    residue_ids: Sequence[str],
+    bonds: IntArray,
+) -> Scene:
+    """Return the Scene of one chain; bond orders and charges are 0."""
+    return Scene(
         name=path.stem,
         atom_names=tuple(names),
         elements=tuple(elements),
-        residue_of_atom=np.zeros(n, dtype=np.int64),
-        residue_names=("MOL",),
-        residue_ids=("1",),
-        chain_of_residue=("A",),
-        bonds=np.empty((0, 2), dtype=np.int64),
-        bond_orders=np.zeros(0),
-        formal_charges=np.zeros(n, dtype=np.int64),
+        residue_of_atom=residue_of_atom,
+        residue_names=tuple(residue_names),
+        residue_ids=tuple(residue_ids),
+        chain_of_residue=("A",) * len(residue_names),
+        bonds=bonds,
+        bond_orders=np.zeros(len(bonds)),
+        formal_charges=np.zeros(len(elements), dtype=np.int64),
         masses_da=np.array([atomic_weight_da(e) for e in elements]),
         positions_nm=np.asarray(positions_nm, dtype=np.float64),
         provenance={"source": path.name},
     )
-    return with_orders(with_bonds_by_distance(scene, cell_nm))
 
 
 def _mass_da(symbol: str, atom: Any) -> float:
