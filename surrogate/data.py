@@ -368,7 +368,7 @@ class _Survey:
 
 def _survey(paths: list[Path], held: list[Path], *, canonical: bool, velocities: bool) -> _Survey:
     """Return what the files say of themselves. Raises InputError when they do not go together."""
-    from systems.trajectory.codec import open_trajectory, refuse_joined
+    from systems.trajectory.codec import open_trajectory
 
     if not paths:
         raise InputError("no trajectory given to train on.")
@@ -380,7 +380,6 @@ def _survey(paths: list[Path], held: list[Path], *, canonical: bool, velocities:
         with open_trajectory(path) as reader:
             if reader.scene is None:
                 raise InputError(f"{path} carries no topology; give an HDF5 file written by surromd or MDTraj.")
-            refuse_joined(reader)
             steps = np.diff(reader.time_ps)
             if len(steps) == 0 or not np.allclose(steps, steps[0], rtol=1e-4):
                 raise InputError(f"{path}: frames are not evenly spaced in time; training needs one save interval.")

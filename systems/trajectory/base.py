@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, Self
@@ -12,9 +13,17 @@ import h5py
 import numpy as np
 import numpy.typing as npt
 
-from systems.errors import InputError, TrajectoryError
-from systems.files.whole_file import Checksums, OutputLock, check_frames_read, frame_checksums, frames_digest
+from systems.errors import InputError, SurromdError, TrajectoryError
+from systems.files.whole_file import (
+    Checksums,
+    OutputLock,
+    check_frames_read,
+    frame_checksums,
+    frames_digest,
+    refuse_existing,
+)
 from systems.scene import Scene
+from systems.trajectory.companion_writer import refuse_other_topology, topology_bytes, topology_path, write_topology
 from systems.trajectory.store import (
     CHECKSUMS,
     FRAMES,
@@ -25,6 +34,7 @@ from systems.trajectory.store import (
     FrameStore,
     checked_with_frames,
     consistent_length,
+    create_store,
     get_json,
     read_record,
     read_run_id,
@@ -38,19 +48,59 @@ class TrajectoryWriter(FrameStore, ABC):
 
     lock: OutputLock | None = None
 
-    def __init__(self, path: Path, store: Path, scene: Scene, record: dict[str, Any], *, append: bool) -> None:
+    def __init__(
+        self,
+        path: Path,
+        scene: Scene,
+        record: dict[str, Any],
+        *,
+        append: bool,
+        overwrite: bool,
+        columns: Sequence[str] = (),
+        run_id: str = "",
+    ) -> None:
+        store, pdb = self._store_of(path), topology_path(path)
+        topology = b"" if append and pdb.exists() else topology_bytes(scene)
+        if append and not store.exists():
+            raise TrajectoryError(f"{path} has no {store.name} beside it and cannot be continued.")
+        made = [] if append else [file for file in {store, pdb, path} if not file.exists()]
+        try:
+            if not append:
+                refuse_existing(path, overwrite)
+                refuse_other_topology(path, topology, overwrite=overwrite)
+                create_store(store, scene, record, self._lay_out, columns, overwrite=overwrite, run_id=run_id)
+                write_topology(path, topology)
+                self._begin(path, scene)
+        except SurromdError:
+            for file in made:
+                with suppress(OSError):
+                    file.unlink(missing_ok=True)
+            raise
         super().__init__(store)
         try:
             self.path = path
             check_same_topology(path, self.scene, scene)
             self.scene = scene
             self._adopt()
-            new = {key: value for key, value in record.items() if key not in self.record}
-            if append and new:
-                self.update_record(new)
+            if append:
+                write_topology(path, topology)
+                if new := {key: value for key, value in record.items() if key not in self.record}:
+                    self.update_record(new)
         except BaseException:
             self.close()
             raise
+
+    @staticmethod
+    def _store_of(path: Path) -> Path:
+        """Return the HDF5 file that holds the columns of a trajectory."""
+        return path
+
+    @abstractmethod
+    def _lay_out(self, file: h5py.File, scene: Scene, columns: Sequence[str]) -> None:
+        """Add the format's own groups and columns, and `columns` of velocities and forces, to a new store."""
+
+    def _begin(self, path: Path, scene: Scene) -> None:
+        """Make the file of positions, where it is not the store itself. Raises StorageError."""
 
     @abstractmethod
     def _adopt(self) -> None:

@@ -1,14 +1,13 @@
 """The one trajectory codec: HDF5 (the full record), DCD and XTC (what others read), streaming, append, resume.
 
-And what is made of whole trajectories: one file of several replicas, MDTraj's and MDAnalysis' objects, weights of
-frames.
+And what is made of whole trajectories: MDTraj's and MDAnalysis' objects, weights of frames.
 """
 
 from __future__ import annotations
 
 import weakref
-from collections.abc import Mapping, Sequence
-from contextlib import ExitStack, closing
+from collections.abc import Sequence
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -18,14 +17,14 @@ import numpy.typing as npt
 from systems.errors import InputError, TrajectoryError
 from systems.files.whole_file import OutputLock, journal_path
 from systems.scene import Scene
-from systems.trajectory.base import TrajectoryReader, TrajectoryWriter, check_same_topology
+from systems.trajectory.base import TrajectoryReader, TrajectoryWriter
+from systems.trajectory.companion_writer import POSITIONS_ALONE, is_our_topology, meta_path, topology_path
 from systems.trajectory.store import PER_ATOM, WEIGHTS, Float32Array, Float64Array, FrameStore, open_hdf5
 from systems.units import GAS_CONSTANT_KJ_MOL_K
 
 _HDF5 = (".h5", ".hdf5")
-_WITH_COMPANIONS = (".dcd", ".xtc")
 # What trajectories are written as.
-WRITTEN = (*_HDF5, *_WITH_COMPANIONS)
+WRITTEN = (*_HDF5, *POSITIONS_ALONE)
 
 
 def open_writer(
@@ -64,18 +63,16 @@ def open_writer(
         raise InputError(
             f"{path}: trajectories are written as .h5, .dcd or .xtc, not {path.suffix or 'without a suffix'!r}."
         )
-    from systems.trajectory.companion_writer import XtcWriter
     from systems.trajectory.dcd_file import DcdWriter
     from systems.trajectory.hdf5_file import Hdf5Writer
+    from systems.trajectory.xtc_file import XtcWriter
 
     lock = None if locked else OutputLock(path)
-    how: dict[str, Any] = {"append": append, "overwrite": overwrite, "run_id": run_id}
+    kinds: dict[str, type[TrajectoryWriter]] = {".dcd": DcdWriter, ".xtc": XtcWriter}
     try:
-        writer: TrajectoryWriter
-        if suffix in _WITH_COMPANIONS:
-            writer = (DcdWriter if suffix == ".dcd" else XtcWriter)(path, scene, record, **how)
-        else:
-            writer = Hdf5Writer(path, scene, record, columns=columns, **how)
+        writer = kinds.get(suffix, Hdf5Writer)(
+            path, scene, record, append=append, overwrite=overwrite, columns=columns, run_id=run_id
+        )
     except BaseException:
         if lock is not None:
             lock.close()
@@ -88,7 +85,7 @@ def open_writer(
 
 def refuse_columns(path: Path, columns: Sequence[str]) -> None:
     """Raise InputError where a trajectory of this name cannot hold these columns beside positions."""
-    if columns and path.suffix.lower() in _WITH_COMPANIONS:
+    if columns and path.suffix.lower() in POSITIONS_ALONE:
         kind = path.suffix[1:].upper()
         raise InputError(f"{path}: {kind} files hold positions only; write an .h5 to keep {' and '.join(columns)}.")
     for name in columns:
@@ -98,12 +95,9 @@ def refuse_columns(path: Path, columns: Sequence[str]) -> None:
 
 def companions(path: Path) -> tuple[Path, ...]:
     """Return the paths of what is written beside a trajectory."""
-    from systems.trajectory import companion_writer
-
-    pdb, meta = companion_writer.companions(path)
-    if path.suffix.lower() not in _WITH_COMPANIONS:
-        return pdb, journal_path(path)
-    return pdb, meta, journal_path(meta)
+    if path.suffix.lower() not in POSITIONS_ALONE:
+        return topology_path(path), journal_path(path)
+    return topology_path(path), meta_path(path), journal_path(meta_path(path))
 
 
 def open_trajectory(path: str | Path, *, top: str | Path | None = None) -> TrajectoryReader:
@@ -115,7 +109,7 @@ def open_trajectory(path: str | Path, *, top: str | Path | None = None) -> Traje
     TrajectoryError when the file is missing, damaged or incomplete (it is never read as far as it goes); InputError
     when a topology is needed, or does not fit.
     """
-    from systems.trajectory import companion_writer, dcd_file, foreign_readers, hdf5_file
+    from systems.trajectory import dcd_file, foreign_readers, hdf5_file, xtc_file
     from systems.trajectory.foreign_scenes import XYZ_SUFFIXES, is_mdtraj_format
 
     path, top = Path(path), None if top is None else Path(top)
@@ -127,111 +121,17 @@ def open_trajectory(path: str | Path, *, top: str | Path | None = None) -> Traje
     if suffix == ".dcd":
         return dcd_file.DcdReader(path, top)
     if suffix == ".xtc":
-        if companion_writer.is_of_xtc(path):
-            return companion_writer.XtcReader(path, top)
-        pdb = companion_writer.topology_path(path)
-        top = pdb if top is None and companion_writer.is_our_topology(pdb) else top
+        if xtc_file.is_of_xtc(path):
+            return xtc_file.XtcReader(path, top)
+        if top is None and is_our_topology(topology_path(path)):
+            top = topology_path(path)
+    if suffix in (".xtc", ".nc", ".ncdf", ".netcdf"):
         return foreign_readers.StreamReader(path, top)
-    if suffix in (".nc", ".ncdf", ".netcdf"):
-        return foreign_readers.StreamReader(path, top)
-    if suffix == ".traj":
-        return foreign_readers.AseReader(path, top)
-    if path.name.lower().endswith(XYZ_SUFFIXES):
-        return foreign_readers.XyzReader(path, top)
+    if path.name.lower().endswith((*XYZ_SUFFIXES, ".traj")):
+        return foreign_readers.AtomsReader(path, top)
     if is_mdtraj_format(path):
         return foreign_readers.MdtrajReader(path, top)
     return foreign_readers.MdanalysisReader(path, top)
-
-
-# ---- several replicas in one file -----------------------------------------------------------------------------------
-
-
-KEY = "joined"
-_AT_ONCE = 2048
-
-
-def join(paths: Sequence[Path], out: Path, *, overwrite: bool = False) -> Path:
-    """Write the frames of replicas into one file, in the order of `paths`, and return its path.
-
-    Kept are positions, cells, flags, chunks and scalars, and velocities and forces where all replicas and the format
-    hold them. Times are each replica's own, moved behind those before it. Raises InputError where the replicas differ
-    in atoms or save interval, TrajectoryError, StorageError.
-    """
-    with ExitStack() as stack:
-        readers = [stack.enter_context(open_trajectory(path)) for path in paths]
-        first, scene = readers[0], readers[0].scene
-        for reader in readers:
-            if reader.scene is None or scene is None:
-                raise InputError(f"{reader.path} holds no topology; it cannot be joined.")
-            check_same_topology(reader.path, reader.scene, scene)
-        assert scene is not None
-        intervals = [float(np.median(np.diff(r.time_ps))) for r in readers if r.n_frames > 1]
-        stated = first.record.get("save_every_ps")
-        interval_ps = intervals[0] if intervals else float(stated) if isinstance(stated, int | float) else 1.0
-        if any(abs(other - interval_ps) > 1e-6 * interval_ps for other in intervals):
-            raise InputError(f"{out}: its replicas differ in the time between frames; join those of one interval.")
-        columns = [] if out.suffix.lower() in _WITH_COMPANIONS else list(PER_ATOM)
-        columns = [c for c in columns if all(getattr(r, f"read_{c}")(0, 1) is not None for r in readers)]
-        starts = np.cumsum([0, *(r.n_frames for r in readers)]).tolist()
-        replicas = [
-            {"file": r.path.name, "first_frame": begin, "n_frames": r.n_frames, "record": r.record}
-            for r, begin in zip(readers, starts, strict=False)
-        ]
-        complete = all(r.record.get("completed") is not False for r in readers)
-        common = {key: value for key, value in first.record.items() if all(r.record.get(key) == value for r in readers)}
-        record = common | {KEY: {"replicas": replicas}, "completed": False}
-        end_ps = 0.0
-        with open_writer(out, scene, record, overwrite=overwrite, columns=columns) as writer:
-            for reader in readers:
-                if not reader.n_frames:
-                    continue
-                shift_ps = 0.0 if writer.last_time_ps is None else end_ps + interval_ps - float(reader.time_ps[0])
-                for start in range(0, reader.n_frames, _AT_ONCE):
-                    _copy(reader, slice(start, min(start + _AT_ONCE, reader.n_frames)), writer, shift_ps, columns)
-                end_ps = float(reader.time_ps[-1]) + shift_ps
-            writer.update_record({"completed": complete})
-    return out
-
-
-def replicas_of(record: Mapping[str, Any], n_frames: int) -> list[tuple[slice, dict[str, Any]]]:
-    """Return the frames of each replica in a file and what it says of itself: of one that is not joined, all.
-
-    Raises TrajectoryError where the record does not fit the file.
-    """
-    if KEY not in record:
-        return [(slice(0, n_frames), dict(record))]
-    found, at = [], 0
-    for replica in record[KEY]["replicas"]:
-        begin, n = int(replica["first_frame"]), int(replica["n_frames"])
-        if begin != at or begin + n > n_frames:
-            raise TrajectoryError(
-                f"the record of a joined file names {begin + n} frames or more, it holds {n_frames}; join again."
-            )
-        at = begin + n
-        if n:
-            found.append((slice(begin, at), dict(replica["record"])))
-    return found
-
-
-def refuse_joined(reader: TrajectoryReader) -> None:
-    """Raise InputError for a joined file, where time must be unbroken."""
-    if KEY in reader.record:
-        names = [str(replica["file"]) for replica in reader.record[KEY]["replicas"]]
-        raise InputError(f"{reader.path} joins {len(names)} replicas; give them as files ({names[0]}, ...).")
-
-
-def _copy(reader: TrajectoryReader, part: slice, writer: Any, shift_ps: float, columns: Sequence[str]) -> None:
-    frames = (part.start, part.stop)
-    writer.append(
-        reader.read(*frames),
-        reader.time_ps[part] + shift_ps,
-        flags=None if reader.flags is None else reader.flags[part],
-        chunk_idx=None if reader.chunk_idx is None else reader.chunk_idx[part],
-        scalars={name: values[part] for name, values in reader.scalars.items()},
-        velocities_nm_ps=reader.read_velocities(*frames) if "velocities" in columns else None,
-        forces_kj_mol_nm=reader.read_forces(*frames) if "forces" in columns else None,
-        cell_nm=reader.read_cells(*frames),
-    )
 
 
 # ---- objects of MDTraj and MDAnalysis, through memory ---------------------------------------------------------------
@@ -351,4 +251,4 @@ def write_weights(path: Path, weights: Float64Array) -> None:
 
 def _store(path: Path) -> Path:
     """Return the HDF5 file that holds a trajectory's columns: itself, or what lies beside a DCD."""
-    return next((p for p in companions(path) if p.name.endswith(".meta.h5")), path)
+    return meta_path(path) if path.suffix.lower() in POSITIONS_ALONE else path

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import os
 import warnings
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -25,14 +26,7 @@ from systems.chemistry.distance_bonds import lengths_and_angles, read_cells
 from systems.errors import TrajectoryError
 from systems.files.whole_file import write_whole
 from systems.scene import Scene
-from systems.trajectory.companion_writer import (
-    CompanionReader,
-    CompanionWriter,
-    check_size,
-    companions,
-    is_of_xtc,
-    is_our_topology,
-)
+from systems.trajectory.companion_writer import is_our_topology, meta_path, topology_path
 from systems.trajectory.store import (
     CELLS,
     ENDS,
@@ -43,17 +37,14 @@ from systems.trajectory.store import (
     FrameBlock,
     add_column,
 )
+from systems.trajectory.xtc_file import CompanionReader, CompanionWriter, check_size, is_of_xtc
 
 AKMA_PS = 4.888821e-2  # the value MDAnalysis and OpenMM use for CHARMM's unit of time
 _HEADER_BYTES = 92
 _MOST_ATOMS = 2**31 // 13  # a frame's bytes are counted in 32 bits
 _TITLE = b"Written by surromd"
 _LAMMPS_TITLE = b"Written by LAMMPS"
-_LEAST_LAMMPS_FS = 0.05
-_LAMMPS_NOTE = "written by LAMMPS; its time step is taken to be in fs (`units real`)."
-_LAMMPS_UNKNOWN = (
-    "written by LAMMPS with a time step that is too short for fs (`units metal` or `lj`); its times are not used."
-)
+_LAMMPS_NOTE = "written by LAMMPS, whose time step may be in fs, ps or reduced units; it is not used: state `dt_ps`."
 _LAST_VERSION_WITH_ANGLES = 24
 _LIKELY_DEG = (40.0, 140.0)
 
@@ -103,22 +94,18 @@ class DcdLayout:
             raise TrajectoryError(f"{path} is cut short inside its header.") from error
         if not 1 <= n_atoms < _MOST_ATOMS:
             raise TrajectoryError(f"{path} is damaged: its header states {n_atoms} atoms.")
-        unit_ps, notes = AKMA_PS, list[str]()
-        # MDTraj and VMD write a time step of one unit, whatever the times were.
-        states_time = not (delta == 1.0 and fields[2] == 1)
-        if _LAMMPS_TITLE in titles:
-            # LAMMPS writes its time step in its own units, which no title names: fs (real), ps (metal) or reduced ones.
-            unit_ps, states_time = 1e-3, bool(delta >= _LEAST_LAMMPS_FS)
-            notes = [_LAMMPS_NOTE if states_time else _LAMMPS_UNKNOWN]
+        is_lammps = _LAMMPS_TITLE in titles
+        # MDTraj and VMD write a time step of one unit, whatever the times were; LAMMPS one in units of its own.
+        states_time = not (delta == 1.0 and fields[2] == 1) and not is_lammps
         # The time step is float32: digits beyond its seventh are noise.
-        interval_ps = float(f"{float(delta) * unit_ps * max(int(fields[2]), 1):.6g}")
+        interval_ps = float(f"{float(delta) * AKMA_PS * max(int(fields[2]), 1):.6g}")
         states_time = states_time and bool(np.isfinite(interval_ps) and interval_ps > 0)
         if not (np.isfinite(interval_ps) and interval_ps > 0):
             interval_ps = 1.0
         first_time_ps = interval_ps * int(fields[1]) / max(int(fields[2]), 1)
         return DcdLayout(n_atoms, first_frame_at, order, bool(charmm and fields[10]), int(fields[0]),
                          first_time_ps, interval_ps, size, path, _TITLE in titles, states_time,
-                         int(fields[19]), tuple(notes))  # fmt: skip
+                         int(fields[19]), (_LAMMPS_NOTE,) if is_lammps else ())  # fmt: skip
 
     @property
     def frame_dtype(self) -> np.dtype[Any]:
@@ -245,7 +232,7 @@ class DcdWriter(CompanionWriter):
 
     _layout: DcdLayout
 
-    def _lay_out(self, file: h5py.File) -> None:
+    def _lay_out(self, file: h5py.File, scene: Scene, columns: Sequence[str]) -> None:
         add_column(file, "time", 0, "<f8")
 
     def _head(self, scene: Scene) -> bytes:
@@ -287,8 +274,7 @@ class DcdReader(CompanionReader):
     def __init__(self, path: Path, top: Path | None) -> None:
         super().__init__(path)
         self._layout = layout = DcdLayout.read(path)
-        pdb, meta = companions(path)
-        if meta.exists() and not is_of_xtc(path):
+        if meta_path(path).exists() and not is_of_xtc(path):
             self._read_companion(top, with_ends=False)
             completed = self.record.get("completed") is True
             check_size(path, self.n_frames, layout.offset(self.n_frames), completed=completed)
@@ -298,7 +284,7 @@ class DcdReader(CompanionReader):
             self.n_atoms, self.n_frames = layout.n_atoms, layout.whole_frames()
             self.time_ps, self.times_known = layout.times_ps(self.n_frames), layout.states_time
             self.notes = layout.notes
-            top = top or (pdb if is_our_topology(pdb) else None)
+            top = top or (topology_path(path) if is_our_topology(topology_path(path)) else None)
         self._frames: npt.NDArray[Any] = np.empty(0, dtype=layout.frame_dtype)
         if self.n_frames:
             self._frames = np.memmap(path, layout.frame_dtype, "r", layout.first_frame_at, (self.n_frames,))

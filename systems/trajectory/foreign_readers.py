@@ -428,7 +428,7 @@ class H5mdReader(TrajectoryReader):
         self._file.close()
 
 
-# ---- XYZ ------------------------------------------------------------------------------------------------------------
+# ---- XYZ and ASE ----------------------------------------------------------------------------------------------------
 
 
 _FIELD = re.compile(r'(\w+)\s*=\s*(?:"([^"]*)"|\'([^\']*)\'|(\S+))')
@@ -441,25 +441,31 @@ class _Frame(NamedTuple):
     cell_nm: Float64Array | None
 
 
-class XyzReader(TrajectoryReader):
-    """Reads an XYZ file whole into memory; names or elements are the file's, bonds found by distance.
+class AtomsReader(TrajectoryReader):
+    """Reads an XYZ file, or one of ASE's `Trajectory`, whole into memory; names or elements are the file's, bonds found
+    by distance.
 
-    Raises TrajectoryError for a damaged file or one of changing atoms, InputError for a `top` that does not fit.
+    Raises TrajectoryError for a damaged file, one of changing atoms, or where ase is not installed; InputError for a
+    `top` that does not fit.
     """
 
     def __init__(self, path: Path, top: Path | None) -> None:
         super().__init__(path)
-        frames = _frames(path)
+        is_ase = path.suffix.lower() == ".traj"
+        frames = _ase_frames(path) if is_ase else _xyz_frames(path)
         if not frames:
             raise TrajectoryError(f"{path} holds no frame.")
         first, self.n_frames, self.n_atoms = frames[0], len(frames), len(frames[0].names)
+        for k, frame in enumerate(frames):
+            check_same_atoms(frame.names, first.names, path, k)
         self.time_ps, self.times_known = np.arange(self.n_frames, dtype=np.float64), False
         self._positions = np.stack([f.positions_nm for f in frames])
         cells = [f.cell_nm for f in frames if f.cell_nm is not None]
         self._cells = np.stack(cells) if len(cells) == self.n_frames else None
         stated = self._scene_of(top)
         if stated is None:
-            stated = named_scene(path, first.names, _elements(first.names, path), first.positions_nm, first.cell_nm)
+            names = [f"{e}{k + 1}" for k, e in enumerate(first.names)] if is_ase else first.names
+            stated = named_scene(path, names, _elements(first.names, path), first.positions_nm, first.cell_nm)
         self._take_scene(stated, top)
 
     def _read(self, start: int, stop: int, stride: int) -> Float32Array:
@@ -469,16 +475,36 @@ class XyzReader(TrajectoryReader):
         return None if self._cells is None else self._cells[start:stop:stride].copy()
 
 
-def _frames(path: Path) -> list[_Frame]:
+def _ase_frames(path: Path) -> list[_Frame]:
+    try:
+        from ase.io.trajectory import Trajectory
+    except ImportError as error:
+        raise TrajectoryError(
+            f"{path} is read by ase: `pip install ase`, or convert it elsewhere by `ase convert {path.name} "
+            f"{path.stem}.xyz`."
+        ) from error
+    try:
+        with Trajectory(str(path)) as file:
+            return [
+                _Frame(
+                    atoms.get_chemical_symbols(),
+                    np.asarray(atoms.positions * _NM, dtype=np.float32),
+                    atoms.cell.array * _NM if atoms.pbc.all() else None,
+                )
+                for atoms in file
+            ]
+    except Exception as error:  # ase raises whatever its parts do
+        raise TrajectoryError(f"{path} cannot be read by ase: {first_line(error)}.") from error
+
+
+def _xyz_frames(path: Path) -> list[_Frame]:
     frames: list[_Frame] = []
     try:
         with _open_text(path) as file:
             for count in file:
-                if not count.strip():
-                    continue
-                n, comment = int(count), file.readline()
-                frames.append(_frame([line.split() for line in itertools.islice(file, n)], comment, n))
-                check_same_atoms(frames[-1].names, frames[0].names, path, len(frames) - 1)
+                if count.strip():
+                    n, comment = int(count), file.readline()
+                    frames.append(_frame([line.split() for line in itertools.islice(file, n)], comment, n))
     except (ValueError, IndexError, OSError, EOFError, zlib.error) as error:
         raise TrajectoryError(f"{path} is damaged or cut short in frame {len(frames)} ({error}).") from error
     return frames
@@ -522,63 +548,3 @@ def _elements(names: list[str], path: Path) -> list[str]:
             raise InputError(f"{path}: the element of atom {i} ({name}) is not known; give a PDB file with `top`.")
         out.append(element)
     return out
-
-
-# ---- ASE ------------------------------------------------------------------------------------------------------------
-
-
-class AseReader(TrajectoryReader):
-    """A file of ASE's `Trajectory`, read frame by frame; elements are the file's, bonds found by distance.
-
-    Raises TrajectoryError where ase is not installed or cannot read it, InputError for a `top` that does not fit.
-    """
-
-    def __init__(self, path: Path, top: Path | None) -> None:
-        super().__init__(path)
-        try:
-            from ase.io.trajectory import Trajectory
-        except ImportError as error:
-            raise TrajectoryError(
-                f"{path} is read by ase: `pip install ase`, or convert it elsewhere by `ase convert {path.name} "
-                f"{path.stem}.xyz`."
-            ) from error
-        try:
-            self._frames: Any = Trajectory(str(path))
-            self.n_frames = len(self._frames)
-            first = self._frames[0]
-        except Exception as error:  # ase raises whatever its parts do
-            raise TrajectoryError(f"{path} cannot be read by ase: {first_line(error)}.") from error
-        self.n_atoms = len(first)
-        self.time_ps, self.times_known = np.arange(self.n_frames, dtype=np.float64), False
-        self._elements = [str(x) for x in first.get_chemical_symbols()]
-        stated = self._scene_of(top)
-        if stated is None:
-            cell = first.cell.array * _NM if first.pbc.all() else None
-            names = [f"{e}{k + 1}" for k, e in enumerate(self._elements)]
-            stated = named_scene(path, names, self._elements, first.positions * _NM, cell)
-        self._take_scene(stated, top)
-
-    def _read(self, start: int, stop: int, stride: int) -> Float32Array:
-        out = np.empty((len(range(start, stop, stride)), self.n_atoms, 3), dtype=np.float32)
-        for k, frame in enumerate(self._stored(start, stop, stride)):
-            check_same_atoms(frame.get_chemical_symbols(), self._elements, self.path, start + k * stride)
-            out[k] = frame.positions * _NM
-        return out
-
-    def _read_cells(self, start: int, stop: int, stride: int) -> Float64Array | None:
-        frames = self._stored(start, stop, stride)
-        if not all(frame.pbc.all() for frame in frames):
-            return None
-        return np.array([frame.cell.array * _NM for frame in frames], dtype=np.float64).reshape(-1, 3, 3)
-
-    def _stored(self, start: int, stop: int, stride: int) -> list[Any]:
-        try:
-            return [self._frames[k] for k in range(start, stop, stride)]
-        except Exception as error:  # ase raises whatever its parts do
-            raise TrajectoryError(
-                f"{self.path} is damaged in frames {start} to {stop} ({first_line(error)})."
-            ) from error
-
-    def close(self) -> None:
-        super().close()
-        self._frames.close()

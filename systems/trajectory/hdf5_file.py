@@ -21,10 +21,8 @@ import numpy as np
 
 from systems.chemistry.distance_bonds import lengths_and_angles, read_cells
 from systems.errors import InputError, TrajectoryError
-from systems.files.whole_file import refuse_existing
 from systems.scene import ATOMIC_NUMBERS, Scene
 from systems.trajectory.base import TrajectoryReader, TrajectoryWriter
-from systems.trajectory.companion_writer import refuse_other_topology, topology_bytes, topology_path, write_topology
 from systems.trajectory.foreign_readers import counted_note
 from systems.trajectory.foreign_scenes import (
     bonds_completed,
@@ -42,7 +40,6 @@ from systems.trajectory.store import (
     Float64Array,
     FrameBlock,
     add_column,
-    create_store,
     damage_reported,
     open_hdf5,
     program_version,
@@ -66,29 +63,47 @@ _BOND_TYPES = {1.0: "Single", 1.5: "Aromatic", 2.0: "Double", 3.0: "Triple"}
 class Hdf5Writer(TrajectoryWriter):
     """Writes one HDF5 trajectory; see `systems.trajectory.codec.open_writer` for the arguments and errors."""
 
-    def __init__(
-        self,
-        path: Path,
-        scene: Scene,
-        record: dict[str, Any],
-        *,
-        append: bool,
-        overwrite: bool,
-        columns: Sequence[str] = (),
-        run_id: str = "",
-    ) -> None:
-        topology = b"" if append and topology_path(path).exists() else topology_bytes(scene)
-        if not append:
-            refuse_existing(path, overwrite)
-            refuse_other_topology(path, topology, overwrite=overwrite)
-            create_store(path, scene, record, lambda file: _lay_out(file, scene, columns), columns,
-                         overwrite=overwrite, run_id=run_id)  # fmt: skip
-        super().__init__(path, path, scene, record, append=append)
-        try:
-            write_topology(path, topology)
-        except BaseException:
-            self.close()
-            raise
+    def _lay_out(self, file: h5py.File, scene: Scene, columns: Sequence[str]) -> None:
+        # MDTraj's and H5MD's groups, empty columns and units.
+        version = program_version()
+        about = {"conventions": "Pande", "conventionVersion": "1.1", "program": "surromd", "title": scene.name,
+                 "programVersion": version, "application": "surromd"}  # fmt: skip
+        for key, value in about.items():
+            file.attrs[key] = np.bytes_(value.encode("ascii", "replace"))
+        frame_bytes = 12 * max(scene.n_atoms, 1)
+        chunk = min(max(_CHUNK_BYTES // frame_bytes, 1), 1024)
+        periodic = scene.cell_nm is not None
+        for name in ("coordinates", *columns):
+            add_column(file, name, 0, "<f4", tail=(scene.n_atoms, 3), chunk=chunk)
+        add_column(file, "time", 0, "<f8")
+        for name in ("cell_lengths", "cell_angles") if periodic else ():
+            add_column(file, name, 0, "<f4", tail=(3,))
+        for name, (units, unit, _) in _UNITS.items():
+            if name in file:
+                file[name].attrs["units"], file[name].attrs["unit"] = np.bytes_(units), unit
+        file.create_dataset("topology", data=np.array([_topology_json(scene).encode("ascii")]))
+
+        h5md = file.create_group("h5md")
+        h5md.attrs["version"] = np.array([1, 1], dtype=np.int32)
+        h5md.create_group("author").attrs["name"] = "surromd"
+        creator = h5md.create_group("creator")
+        creator.attrs["name"], creator.attrs["version"] = "surromd", version
+        particles = file.create_group("particles/trajectory")
+        box = particles.create_group("box")
+        box.attrs["dimension"] = np.int32(3)
+        box.attrs["boundary"] = np.array([b"periodic" if periodic else b"none"] * 3, dtype="S8")
+        add_column(file, f"{_POSITION}/step", 0, "<i8")
+        position = particles["position"]
+        position["value"], position["time"] = file["coordinates"], file["time"]
+        for name in columns:
+            group = particles.create_group(_UNITS[name][2])
+            group["value"], group["time"], group["step"] = file[name], file["time"], position["step"]
+        if periodic:
+            add_column(file, EDGES, 0, "<f8", tail=(3, 3)).attrs["unit"] = "nm"
+            box["edges/time"], box["edges/step"] = file["time"], position["step"]
+        particles["species"] = np.array([ATOMIC_NUMBERS.get(e, 0) for e in scene.elements], dtype=np.int32)
+        particles["mass"] = scene.masses_da
+        particles["mass"].attrs["unit"] = "u"
 
     def _adopt(self) -> None:
         if "coordinates" not in self.file:
@@ -203,48 +218,6 @@ def _per_unit(file: h5py.File, name: str, per: Callable[[Any], float | None], pa
         shown = units.decode(errors="replace") if isinstance(units, bytes) else units
         raise TrajectoryError(f"{path}: {name} are in {shown!r}, a unit that is not known; write it in nm and ps.")
     return factor
-
-
-def _lay_out(file: h5py.File, scene: Scene, columns: Sequence[str]) -> None:
-    """Add MDTraj's and H5MD's groups, empty columns and units."""
-    version = program_version()
-    for key, value in {"conventions": "Pande", "conventionVersion": "1.1", "program": "surromd", "title": scene.name,
-                       "programVersion": version, "application": "surromd"}.items():  # fmt: skip
-        file.attrs[key] = np.bytes_(value.encode("ascii", "replace"))
-    frame_bytes = 12 * max(scene.n_atoms, 1)
-    chunk = min(max(_CHUNK_BYTES // frame_bytes, 1), 1024)
-    periodic = scene.cell_nm is not None
-    for name in ("coordinates", *columns):
-        add_column(file, name, 0, "<f4", tail=(scene.n_atoms, 3), chunk=chunk)
-    add_column(file, "time", 0, "<f8")
-    for name in ("cell_lengths", "cell_angles") if periodic else ():
-        add_column(file, name, 0, "<f4", tail=(3,))
-    for name, (units, unit, _) in _UNITS.items():
-        if name in file:
-            file[name].attrs["units"], file[name].attrs["unit"] = np.bytes_(units), unit
-    file.create_dataset("topology", data=np.array([_topology_json(scene).encode("ascii")]))
-
-    h5md = file.create_group("h5md")
-    h5md.attrs["version"] = np.array([1, 1], dtype=np.int32)
-    h5md.create_group("author").attrs["name"] = "surromd"
-    creator = h5md.create_group("creator")
-    creator.attrs["name"], creator.attrs["version"] = "surromd", version
-    particles = file.create_group("particles/trajectory")
-    box = particles.create_group("box")
-    box.attrs["dimension"] = np.int32(3)
-    box.attrs["boundary"] = np.array([b"periodic" if periodic else b"none"] * 3, dtype="S8")
-    add_column(file, f"{_POSITION}/step", 0, "<i8")
-    position = particles["position"]
-    position["value"], position["time"] = file["coordinates"], file["time"]
-    for name in columns:
-        group = particles.create_group(_UNITS[name][2])
-        group["value"], group["time"], group["step"] = file[name], file["time"], position["step"]
-    if periodic:
-        add_column(file, EDGES, 0, "<f8", tail=(3, 3)).attrs["unit"] = "nm"
-        box["edges/time"], box["edges/step"] = file["time"], position["step"]
-    particles["species"] = np.array([ATOMIC_NUMBERS.get(e, 0) for e in scene.elements], dtype=np.int32)
-    particles["mass"] = scene.masses_da
-    particles["mass"].attrs["unit"] = "u"
 
 
 def _topology_json(scene: Scene) -> str:

@@ -217,15 +217,15 @@ def create_store(
     path: Path,
     scene: Scene,
     record: dict[str, Any],
-    lay_out: Callable[[h5py.File], None],
-    per_atom: Sequence[str] = (),
+    lay_out: Callable[[h5py.File, Scene, Sequence[str]], None],
+    columns: Sequence[str],
     *,
     overwrite: bool,
     run_id: str = "",
 ) -> None:
     """Create the file with all headers and no frames; it appears under its name only when it is whole.
 
-    `lay_out` adds the format's own groups and columns, `per_atom` names velocities and forces where frames have them,
+    `lay_out` adds the format's own groups and columns, `columns` names velocities and forces where frames have them,
     `run_id` says whose file it is. Raises TrajectoryError when it exists, InputError for a record that is not JSON,
     StorageError.
     """
@@ -240,9 +240,9 @@ def create_store(
         set_text(group, "record", sealed(json_text(record, "record")), _RECORD_BYTES)
         set_text(group, "scene", sealed(json_text(scene.to_dict(), "scene")))
         add_column(file, "surromd/chunk_idx", 0, "<i4")
-        for name in (FRAMES, *per_atom, *([] if scene.cell_nm is None else [CELLS])):
+        for name in (FRAMES, *columns, *([] if scene.cell_nm is None else [CELLS])):
             add_column(file, f"{CHECKSUMS}/{name}", 0, "<u4")
-        lay_out(file)
+        lay_out(file, scene, columns)
     if path.exists() and journal_path(path).exists():  # of the file that is replaced, perhaps by one of the same run
         AtomicFile(path, writable=True).close()
     create_whole(path, image.getvalue())
@@ -266,14 +266,7 @@ def open_hdf5(path: Path, source: AtomicFile | None = None) -> h5py.File:
             raise storage_error(path, source.failure, "nothing was changed") from error
         if isinstance(error, TrajectoryError):
             raise
-        text = str(error)
-        if "truncated" in text:
-            reason = "it is cut short; restore it from a whole copy"
-        elif "signature" in text:
-            reason = "it is not an HDF5 file"
-        else:
-            reason = text.replace("\n", " ")
-        raise TrajectoryError(f"{path} cannot be read: {reason}.") from error
+        raise TrajectoryError(f"{path} cannot be read as HDF5: {first_line(error)}; restore it from a copy.") from error
 
 
 def column_names(file: h5py.File) -> list[str]:

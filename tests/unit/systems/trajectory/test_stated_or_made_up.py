@@ -282,13 +282,10 @@ def relabelled_dcd(source: Path, into: Path, title: bytes, step: float, every: i
     return into
 
 
-def test_the_time_step_of_lammps_is_in_fs(folder: Path, tmp_path: Path) -> None:
+def test_the_time_step_of_lammps_is_not_used(folder: Path, tmp_path: Path) -> None:
     source, path = folder / "mdtraj.dcd", tmp_path / "a.dcd"
     with open_trajectory(relabelled_dcd(source, path, b"Written by LAMMPS", 2.0, 250)) as reader:
-        assert reader.times_known and np.diff(reader.time_ps) == pytest.approx(0.5)
-        assert any("taken to be in fs" in note for note in reader.notes)
-    with open_trajectory(relabelled_dcd(source, path, b"Written by LAMMPS", 0.001, 250)) as reader:
-        assert not reader.times_known, "ps of `units metal`, or reduced"
+        assert not reader.times_known and any("written by LAMMPS" in note for note in reader.notes)
     with open_trajectory(relabelled_dcd(source, path, b"Written by somebody", 2.0, 250)) as reader:
         assert np.diff(reader.time_ps) == pytest.approx(500 * AKMA_PS, rel=1e-5) and not reader.notes
 
@@ -400,11 +397,8 @@ def test_elements_of_ase_that_change_are_refused(tmp_path: Path, frames: np.ndar
                 out.write(ase.Atoms(later if k > 2 else symbols, positions=10.0 * x))
     with open_trajectory(tmp_path / "same.traj") as reader:
         assert reader.read() == pytest.approx(frames, abs=1e-6)
-    with (
-        open_trajectory(tmp_path / "moved.traj") as reader,
-        pytest.raises(TrajectoryError, match="frame 3 lists other"),
-    ):
-        reader.read()
+    with pytest.raises(TrajectoryError, match="frame 3 lists other"):
+        open_trajectory(tmp_path / "moved.traj")
 
 
 @pytest.mark.parametrize("suffix", ["xtc", "trr", "nc", "dcd", "pdb", "h5"])
