@@ -200,25 +200,11 @@ def frame_checksums(columns: Mapping[str, npt.NDArray[Any]]) -> Checksums:
     return upper
 
 
-def frames_digest(checksums: Mapping[str, Checksums]) -> Any:
-    """Return the SHA-256 object of frames' checksums `(n,)` by name; frames that come later are added to it."""
-    return hashlib.sha256(checksum_rows(checksums))
-
-
 def checksum_rows(checksums: Mapping[str, Checksums]) -> bytes:
-    """Return the checksums of frames as bytes, frame by frame; none of a file of an early version, which has none."""
+    """Return the checksums `(n,)` of frames by name as bytes, frame by frame; none of a file of an early version."""
     if not checksums:
         return b""
     return np.stack([checksums[name] for name in sorted(checksums)], axis=1).astype("<u4").tobytes()
-
-
-def check_frames_read(path: Any, stored: Checksums, found: Checksums, start: int, stride: int) -> None:
-    """Raise TrajectoryError when frames `start`, `start + stride`, ... are not those that were written."""
-    if not np.array_equal(stored, found):
-        bad = start + stride * int(np.argmax(stored != found))
-        raise TrajectoryError(
-            f"{path} is damaged at frame {bad}: it is not what was written (checksum); restore it from a whole copy."
-        )
 
 
 def sealed(text: str) -> str:

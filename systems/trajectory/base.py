@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
@@ -14,14 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from systems.errors import InputError, SurromdError, TrajectoryError
-from systems.files.whole_file import (
-    Checksums,
-    OutputLock,
-    check_frames_read,
-    frame_checksums,
-    frames_digest,
-    refuse_existing,
-)
+from systems.files.whole_file import Checksums, OutputLock, checksum_rows, frame_checksums, refuse_existing
 from systems.scene import Scene
 from systems.trajectory.companion_writer import refuse_other_topology, topology_bytes, topology_path, write_topology
 from systems.trajectory.store import (
@@ -293,7 +287,12 @@ class TrajectoryReader(ABC):
             scalars = {key: values[frames] for key, values in self.scalars.items()}
             columns = checked_with_frames(stored, self.time_ps[frames], self.chunk_idx[frames], flags, scalars)
         found = frame_checksums(columns)
-        check_frames_read(self.path, self.checksums[name][frames], found, frames.start, frames.step)
+        written = self.checksums[name][frames]
+        if not np.array_equal(written, found):
+            bad = frames.start + frames.step * int(np.argmax(written != found))
+            raise TrajectoryError(
+                f"{self.path} is damaged at frame {bad}: it is not what was written (checksum); restore it from a copy."
+            )
 
     def read(self, start: int = 0, stop: int | None = None, stride: int = 1) -> Float32Array:
         """Return positions `(n, n_atoms, 3)` float32 nm of frames `start:stop:stride` (negative counts from the end).
@@ -314,7 +313,8 @@ class TrajectoryReader(ABC):
 
     def digest(self, n_frames: int) -> str:
         """Return the hash that the writer of the first frames had of them (`TrajectoryWriter.digest`)."""
-        return frames_digest({name: values[:n_frames] for name, values in self.checksums.items()}).hexdigest()
+        rows = checksum_rows({name: values[:n_frames] for name, values in self.checksums.items()})
+        return hashlib.sha256(rows).hexdigest()
 
     def read_velocities(self, start: int = 0, stop: int | None = None, stride: int = 1) -> Float32Array | None:
         """Return velocities `(n, n_atoms, 3)` nm/ps, None when the file holds none. Frames and errors as in `read`."""

@@ -117,7 +117,7 @@ def open_trajectory(path: str | Path, *, top: str | Path | None = None) -> Traje
     if suffix in _HDF5 and not hdf5_file.is_plain_h5md(path):
         return hdf5_file.Hdf5Reader(path, top)
     if suffix in (*_HDF5, ".h5md"):
-        return foreign_readers.H5mdReader(path, top)
+        return hdf5_file.H5mdReader(path, top)
     if suffix == ".dcd":
         return dcd_file.DcdReader(path, top)
     if suffix == ".xtc":

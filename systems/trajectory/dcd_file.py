@@ -14,7 +14,6 @@ from __future__ import annotations
 import os
 import warnings
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -49,96 +48,79 @@ _LAST_VERSION_WITH_ANGLES = 24
 _LIKELY_DEG = (40.0, 140.0)
 
 
-@dataclass(frozen=True)
 class DcdLayout:
-    """Where the frames of a DCD lie, and what its header says. Sizes in bytes."""
+    """Where the frames of a DCD lie, and what its header says. Sizes in bytes.
 
-    n_atoms: int
-    first_frame_at: int
-    byte_order: str = "<"
-    has_cell: bool = False
-    n_frames_in_header: int = 0
-    first_time_ps: float = 0.0
-    interval_ps: float = 0.0
-    file_bytes: int = 0
-    path: Path = Path()
-    has_our_title: bool = False
-    states_time: bool = True
-    charmm_version: int = 24
-    notes: tuple[str, ...] = ()
+    `interval_ps` between frames is 1 where no time step is stated. Raises TrajectoryError when the header is damaged or
+    of a kind that is not supported.
+    """
 
-    @staticmethod
-    def read(path: Path) -> DcdLayout:
-        """Read the header. Raises TrajectoryError when it is damaged or of a kind that is not supported."""
+    def __init__(self, path: Path) -> None:
         try:
             with path.open("rb") as file:
                 head = file.read(_HEADER_BYTES)
-                size = os.fstat(file.fileno()).st_size
+                self.file_bytes = os.fstat(file.fileno()).st_size
                 order = next((o for o in "<>" if np.frombuffer(head[:4], f"{o}i4")[:1] == 84), "")
                 if len(head) < _HEADER_BYTES or not order or head[4:8] != b"CORD":
-                    what = "is empty" if size == 0 else "is not a DCD file of the 32-bit kind"
+                    what = "is not a DCD file of the 32-bit kind" if self.file_bytes else "is empty"
                     raise TrajectoryError(f"{path} {what}.")
-                fields = np.frombuffer(head[8:88], f"{order}i4")
-                charmm = fields[19] != 0
-                delta = np.frombuffer(head[44:52], f"{order}f4" if charmm else f"{order}f8")[0]
-                if fields[8] != 0 or (charmm and fields[11] != 0):
+                fields = np.frombuffer(head[8:88], f"{order}i4").tolist()
+                is_charmm = fields[19] != 0
+                delta = float(np.frombuffer(head[44:52], f"{order}f4" if is_charmm else f"{order}f8")[0])
+                if fields[8] != 0 or (is_charmm and fields[11] != 0):
                     raise TrajectoryError(f"{path} has fixed atoms or a fourth dimension; convert it first.")
-                title = int(np.frombuffer(file.read(4), f"{order}i4")[0])
-                titles = file.read(title + 4)
-                _, n_atoms, _ = np.frombuffer(file.read(12), f"{order}i4").tolist()
-                first_frame_at = file.tell()
+                title = file.read(int(np.frombuffer(file.read(4), f"{order}i4")[0]) + 4)
+                _, self.n_atoms, _ = np.frombuffer(file.read(12), f"{order}i4").tolist()
+                self.first_frame_at = file.tell()
         except OSError as error:
-            reason = "does not exist" if isinstance(error, FileNotFoundError) else f"cannot be read: {error.strerror}"
-            raise TrajectoryError(f"{path} {reason}.") from error
+            raise TrajectoryError(f"{path} cannot be read: {error.strerror}.") from error
         except (ValueError, IndexError) as error:
             raise TrajectoryError(f"{path} is cut short inside its header.") from error
-        if not 1 <= n_atoms < _MOST_ATOMS:
-            raise TrajectoryError(f"{path} is damaged: its header states {n_atoms} atoms.")
-        is_lammps = _LAMMPS_TITLE in titles
-        # MDTraj and VMD write a time step of one unit, whatever the times were; LAMMPS one in units of its own.
-        states_time = not (delta == 1.0 and fields[2] == 1) and not is_lammps
+        if not 1 <= self.n_atoms < _MOST_ATOMS:
+            raise TrajectoryError(f"{path} is damaged: its header states {self.n_atoms} atoms.")
+        self.path, self.byte_order, self.charmm_version = path, order, fields[19]
+        self.n_frames_stated, self.has_our_title = fields[0], _TITLE in title
+        self.has_cell = is_charmm and fields[10] != 0
+        is_lammps = _LAMMPS_TITLE in title
+        self.notes = (_LAMMPS_NOTE,) if is_lammps else ()
+        every = max(fields[2], 1)
         # The time step is float32: digits beyond its seventh are noise.
-        interval_ps = float(f"{float(delta) * AKMA_PS * max(int(fields[2]), 1):.6g}")
-        states_time = states_time and bool(np.isfinite(interval_ps) and interval_ps > 0)
-        if not (np.isfinite(interval_ps) and interval_ps > 0):
-            interval_ps = 1.0
-        first_time_ps = interval_ps * int(fields[1]) / max(int(fields[2]), 1)
-        return DcdLayout(n_atoms, first_frame_at, order, bool(charmm and fields[10]), int(fields[0]),
-                         first_time_ps, interval_ps, size, path, _TITLE in titles, states_time,
-                         int(fields[19]), (_LAMMPS_NOTE,) if is_lammps else ())  # fmt: skip
-
-    @property
-    def frame_dtype(self) -> np.dtype[Any]:
-        """The NumPy record of one frame, block lengths included."""
-        o = self.byte_order
-        cell = [("cell", f"{o}i4", (14,))] if self.has_cell else []
+        self.interval_ps = float(f"{delta * AKMA_PS * every:.6g}")
+        has_step = bool(np.isfinite(self.interval_ps) and self.interval_ps > 0)
+        # MDTraj and VMD write a time step of one unit, whatever the times were; LAMMPS one in units of its own.
+        self.states_time = has_step and not is_lammps and not (delta == 1.0 and fields[2] == 1)
+        self.interval_ps = self.interval_ps if has_step else 1.0
+        self.first_time_ps = self.interval_ps * fields[1] / every
+        # One frame, block lengths included.
+        cell = [("cell", f"{order}i4", (14,))] if self.has_cell else []
         axes = [
             entry
             for k in range(3)
-            for entry in ((f"before{k}", f"{o}i4"), (f"x{k}", f"{o}f4", (self.n_atoms,)), (f"after{k}", f"{o}i4"))
+            for entry in (
+                (f"before{k}", f"{order}i4"),
+                (f"x{k}", f"{order}f4", (self.n_atoms,)),
+                (f"after{k}", f"{order}i4"),
+            )
         ]
-        return np.dtype(cell + axes)
+        self.frame_dtype = np.dtype([*cell, *axes])
 
     def offset(self, frame: int) -> int:
-        return self.first_frame_at + frame * int(self.frame_dtype.itemsize)
-
-    def times_ps(self, n_frames: int) -> Float64Array:
-        return self.first_time_ps + self.interval_ps * np.arange(n_frames, dtype=np.float64)
+        return self.first_frame_at + frame * self.frame_dtype.itemsize
 
     def whole_frames(self) -> int:
         """Return the number of frames in the file. Raises TrajectoryError when it ends inside one or lacks some.
 
         Other programs write the number they intend (or 0) and never correct it, so theirs is only warned about.
         """
-        n, rest = divmod(self.file_bytes - self.first_frame_at, int(self.frame_dtype.itemsize))
-        stated = self.n_frames_in_header
-        if stated not in (0, n) and not rest and not self.has_our_title:
-            warnings.warn(f"{self.path}: the header states {stated} frames, the file holds {n}.", stacklevel=2)
-        elif rest or stated not in (0, n):
+        n, rest = divmod(self.file_bytes - self.first_frame_at, self.frame_dtype.itemsize)
+        stated = self.n_frames_stated
+        if rest or (stated not in (0, n) and self.has_our_title):
             raise TrajectoryError(
                 f"{self.path} is cut short or damaged: its header states {stated} frames, {n} are whole; "
                 "restore it from a whole copy."
             )
+        if stated not in (0, n):
+            warnings.warn(f"{self.path}: the header states {stated} frames, the file holds {n}.", stacklevel=2)
         return n
 
 
@@ -239,7 +221,7 @@ class DcdWriter(CompanionWriter):
         return header_bytes(0, 0, 1, 0.0, has_cell=scene.cell_nm is not None) + title_bytes(scene.n_atoms)
 
     def _adopt(self) -> None:
-        self._layout = layout = DcdLayout.read(self.path)
+        self._layout = layout = DcdLayout(self.path)
         ours = (self.scene.n_atoms, "<", self.scene.cell_nm is not None)
         if (layout.n_atoms, layout.byte_order, layout.has_cell) != ours or ENDS in self.file:
             raise TrajectoryError(f"{self.path} was not written by surromd and cannot be continued; take another name.")
@@ -273,16 +255,17 @@ class DcdReader(CompanionReader):
 
     def __init__(self, path: Path, top: Path | None) -> None:
         super().__init__(path)
-        self._layout = layout = DcdLayout.read(path)
+        self._layout = layout = DcdLayout(path)
         if meta_path(path).exists() and not is_of_xtc(path):
-            self._read_companion(top, with_ends=False)
+            self._read_companion(top)
             completed = self.record.get("completed") is True
             check_size(path, self.n_frames, layout.offset(self.n_frames), completed=completed)
             if self.n_atoms != layout.n_atoms:
                 raise TrajectoryError(f"{path} holds {layout.n_atoms} atoms a frame, its record {self.n_atoms}.")
         else:
             self.n_atoms, self.n_frames = layout.n_atoms, layout.whole_frames()
-            self.time_ps, self.times_known = layout.times_ps(self.n_frames), layout.states_time
+            self.time_ps = layout.first_time_ps + layout.interval_ps * np.arange(self.n_frames, dtype=np.float64)
+            self.times_known = layout.states_time
             self.notes = layout.notes
             top = top or (topology_path(path) if is_our_topology(topology_path(path)) else None)
         self._frames: npt.NDArray[Any] = np.empty(0, dtype=layout.frame_dtype)

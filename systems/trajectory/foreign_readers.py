@@ -1,4 +1,4 @@
-"""Trajectories of other programs: through MDTraj, MDAnalysis and ASE; H5MD and extended XYZ, read here.
+"""Trajectories of other programs: through MDTraj, MDAnalysis and ASE; extended XYZ, read here.
 
 Which one reads a format, and what it would make up, stands in `foreign_scenes`. XYZ: positions in Å; `Lattice`, `pbc`
 and `Properties` of each frame's second line are read (https://github.com/libAtoms/extxyz): `Lattice` holds the rows
@@ -20,9 +20,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import IO, Any, NamedTuple
 
-import h5py
 import numpy as np
-import numpy.typing as npt
 
 from systems.chemistry.distance_bonds import read_cells
 from systems.chemistry.element_data import element_symbol
@@ -35,13 +33,11 @@ from systems.trajectory.foreign_scenes import (
     bonds_completed,
     format_of,
     named_scene,
-    nm_per,
-    ps_per,
     scene_from_mdtraj_topology,
     scene_from_structure,
     scene_from_universe,
 )
-from systems.trajectory.store import Float32Array, Float64Array, damage_reported, open_hdf5, read_rows
+from systems.trajectory.store import Float32Array, Float64Array
 
 _NM = 0.1
 # Magic, atoms, step, time, nine numbers of the cell, atoms again; then the precision, a float32.
@@ -345,87 +341,6 @@ def _trr_has_cell(path: Path) -> bool:
         length = int.from_bytes(file.read(12)[8:], "big")
         file.seek(-(-length // 4) * 4 + 8, 1)
         return int.from_bytes(file.read(4), "big") > 0
-
-
-# ---- H5MD of other programs -----------------------------------------------------------------------------------------
-
-
-class H5mdReader(TrajectoryReader):
-    """Reads the positions of an H5MD file's particles. Times without a unit are not known.
-
-    Raises TrajectoryError for a file that is damaged or states no unit of length, InputError for several groups of
-    particles or a `top` that does not fit.
-    """
-
-    def __init__(self, path: Path, top: Path | None) -> None:
-        super().__init__(path)
-        self._file = open_hdf5(path)
-        try:
-            with damage_reported(path):
-                self._read_headers()
-            self._take_scene(self._scene_of(top), top)
-        except BaseException:
-            self._file.close()
-            raise
-
-    def _read_headers(self) -> None:
-        groups = [g for g in self._file.get("particles", {}).values() if "position/value" in g]
-        if not groups:
-            raise InputError(f"{self.path} holds no positions of particles.")
-        if len(groups) > 1:
-            names = ", ".join(g.name.rpartition("/")[2] for g in groups)
-            raise InputError(f"{self.path} holds several groups of particles ({names}); write one of them alone.")
-        self._box, position = groups[0].get("box"), groups[0]["position"]
-        self._value = position["value"]
-        if self._value.ndim != 3 or self._value.shape[2] != 3:
-            raise TrajectoryError(f"{self.path}: positions of shape {self._value.shape}, not (n, n_atoms, 3).")
-        self.n_frames, self.n_atoms = self._value.shape[:2]
-        nm = nm_per(self._value.attrs.get("unit", ""))
-        if nm is None:
-            raise TrajectoryError(
-                f"{self.path}: its positions state no unit of length that is known; set the attribute `unit` of "
-                f"{self._value.name} to 'nm' or 'Angstrom'."
-            )
-        self._nm = nm
-        self.time_ps, self.times_known = np.arange(self.n_frames, dtype=np.float64), False
-        time = position.get("time")
-        ps = None if time is None else ps_per(time.attrs.get("unit", ""))
-        if time is not None and ps is None:
-            self.notes = ("its times state no unit that is known and are not used.",)
-        elif time is not None and ps is not None:
-            steps: Any = time[()]
-            if np.ndim(steps) == 0:
-                steps = float(time.attrs.get("offset", 0.0)) + steps * np.arange(self.n_frames)
-            self.time_ps, self.times_known = ps * np.asarray(steps[: self.n_frames], dtype=np.float64), True
-            if len(self.time_ps) != self.n_frames:
-                raise TrajectoryError(f"{self.path} is damaged: {self.n_frames} frames, {len(self.time_ps)} times.")
-
-    def _read(self, start: int, stop: int, stride: int) -> Float32Array:
-        return read_rows(self._value, start, stop, stride, self.path) * np.float32(self._nm)
-
-    def _read_cells(self, start: int, stop: int, stride: int) -> Float64Array | None:
-        with damage_reported(self.path):
-            edges = None if self._box is None else self._box.get("edges", self._box.attrs.get("edges"))
-            if edges is None:
-                return None
-            column = edges.get("value") if isinstance(edges, h5py.Group) else None
-            if column is not None:
-                values, unit = np.asarray(column[start:stop:stride]), column.attrs.get("unit")
-            else:
-                one: npt.NDArray[Any] = np.asarray(edges[()])
-                values = np.broadcast_to(one, (len(range(start, stop, stride)), *one.shape))
-                unit = edges.attrs.get("unit") if isinstance(edges, h5py.Dataset) else None
-            nm = self._nm if unit is None else nm_per(unit)
-            if nm is None:
-                raise TrajectoryError(
-                    f"{self.path}: its cell is in {unit!r}, a unit that is not known; write it in nm."
-                )
-            cells = values[..., None] * np.eye(3) if values.ndim == 2 else values
-            return None if not np.any(cells) else np.asarray(cells, dtype=np.float64) * nm
-
-    def close(self) -> None:
-        super().close()
-        self._file.close()
 
 
 # ---- XYZ and ASE ----------------------------------------------------------------------------------------------------

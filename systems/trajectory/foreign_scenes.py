@@ -53,7 +53,7 @@ EVERY, SOME, NONE = "stated", "where stated", "no"
 class Format:
     """One format, as the manual's table has it (docs/files.md), which also says what its library makes up.
 
-    `times`, `positions`: EVERY, SOME or NONE, as files state them. `names_atoms`: whether it needs no `top`.
+    `times`: EVERY, SOME or NONE, as files state them. `names_atoms`: whether it needs no `top`.
     `unit_taken`: the unit that is taken, with a line, where nothing states one. `mda`: MDAnalysis' name of it, where
     the suffix does not say.
     """
@@ -63,7 +63,6 @@ class Format:
     reader: str
     times: str
     names_atoms: bool
-    positions: str = EVERY
     unit_taken: str = ""
     mda: str | None = None
 
@@ -75,7 +74,7 @@ FORMATS = (
     Format("XYZ, extended XYZ", XYZ_SUFFIXES, "surromd", NONE, True),
     Format("ASE", (".traj",), "ase", NONE, True),
     Format("XTC", (".xtc",), "MDTraj", EVERY, False),
-    Format("TRR", (".trr",), "MDAnalysis", EVERY, False, positions=SOME),
+    Format("TRR", (".trr",), "MDAnalysis", EVERY, False),
     Format("NetCDF (Amber)", (".nc", ".ncdf", ".netcdf"), "MDTraj", SOME, False),
     Format("PDB", (".pdb", ".pdb.gz"), "MDTraj", NONE, True),
     Format("PDBx/mmCIF", (".pdbx", ".cif", ".mmcif", ".pdbx.gz", ".cif.gz", ".mmcif.gz"), "MDTraj", NONE, True),
@@ -92,7 +91,7 @@ FORMATS = (
     Format("OpenMM XML", (".xml",), "MDTraj", NONE, False),
     Format("H5MD", (".h5md",), "surromd", SOME, False),
     Format("LAMMPS dump", (".lammpsdump", ".dump"), "MDAnalysis", NONE, True, unit_taken="Å", mda="LAMMPSDUMP"),
-    Format("TNG", (".tng",), "MDAnalysis", EVERY, False, positions=SOME),
+    Format("TNG", (".tng",), "MDAnalysis", EVERY, False),
     Format("GROMOS TRC", (".trc",), "MDAnalysis", EVERY, False),
     Format("TRZ", (".trz",), "MDAnalysis", EVERY, False),
     Format("GSD", (".gsd",), "MDAnalysis", NONE, True, unit_taken="Å"),

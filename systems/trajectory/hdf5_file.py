@@ -12,7 +12,7 @@ kJ/mol/nm.
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -125,6 +125,9 @@ class Hdf5Reader(TrajectoryReader):
     Raises TrajectoryError when the file is damaged or incomplete, InputError when `top` does not fit.
     """
 
+    # Of its unit of length.
+    _nm = 1.0
+
     def __init__(self, path: Path, top: Path | None = None) -> None:
         super().__init__(path)
         self._file = open_hdf5(path)
@@ -139,23 +142,31 @@ class Hdf5Reader(TrajectoryReader):
         if "coordinates" not in self._file:
             raise TrajectoryError(f"{self.path} holds no /coordinates: it is not an MDTraj or surromd trajectory.")
         self._read_stored(self._file, self.path)
-        self._coordinates = self._file["coordinates"]
-        if self._coordinates.ndim != 3 or self._coordinates.shape[2] != 3:
-            raise TrajectoryError(f"{self.path}: /coordinates of shape {self._coordinates.shape}, not (n, n_atoms, 3).")
-        self._scale = _per_unit(self._file, "coordinates", nm_per, self.path)
-        self.n_atoms = int(self._coordinates.shape[1])
+        self._take_coordinates(self._file["coordinates"])
         self._is_ours = "surromd" in self._file
         self.times_known = self._is_ours or "time" in self._file
-        if not self._is_ours and "time" in self._file:
-            self.time_ps = self.time_ps * _per_unit(self._file, "time", ps_per, self.path)
-            self.notes = counted_note(self.time_ps)
         unused = () if top is None else (f"{top} is not used: the file holds its own topology.",)
         if self._is_ours:
-            self.notes += unused
+            self.notes = unused
         else:
+            self._check_units()
+            self.notes = counted_note(self.time_ps) if self.times_known else ()
             self._take_foreign_scene(top, unused)
         if self.scene is not None and self.scene.n_atoms != self.n_atoms:
             raise TrajectoryError(f"{self.path}: {self.n_atoms} atoms a frame, but {self.scene.n_atoms} in its scene.")
+
+    def _take_coordinates(self, column: h5py.Dataset) -> None:
+        if column.ndim != 3 or column.shape[2] != 3:
+            raise TrajectoryError(f"{self.path}: {column.name} of shape {column.shape}, not (n, n_atoms, 3).")
+        self._coordinates, self.n_atoms = column, int(column.shape[1])
+
+    def _check_units(self) -> None:
+        """Raise TrajectoryError unless a file of others is in MDTraj's units, where it states any."""
+        for name, per in (("coordinates", nm_per), ("time", ps_per), ("cell_lengths", nm_per)):
+            units = self._file[name].attrs.get("units") if name in self._file else None
+            if units is not None and per(units) != 1.0:
+                shown = units.decode(errors="replace") if isinstance(units, bytes) else units
+                raise TrajectoryError(f"{self.path}: {name} are in {shown!r}; write them in nm and ps.")
 
     def _take_foreign_scene(self, top: Path | None, unused: tuple[str, ...]) -> None:
         own = None
@@ -175,7 +186,7 @@ class Hdf5Reader(TrajectoryReader):
     def _read(self, start: int, stop: int, stride: int) -> Float32Array:
         frames = read_rows(self._coordinates, start, stop, stride, self.path)
         self._check_read(FRAMES, frames, slice(start, stop, stride))
-        return frames if self._scale == 1.0 else (frames * np.float32(self._scale))
+        return frames if self._nm == 1.0 else frames * np.float32(self._nm)
 
     def _read_extra(self, name: str, start: int, stop: int, stride: int) -> Float32Array | None:
         if name not in self._file:
@@ -193,12 +204,66 @@ class Hdf5Reader(TrajectoryReader):
                 return cells
             if "cell_lengths" not in self._file or "cell_angles" not in self._file:
                 return None
-            nm = _per_unit(self._file, "cell_lengths", nm_per, self.path)
-            return read_cells(self._file["cell_lengths"][frames] * nm, self._file["cell_angles"][frames])
+            return read_cells(self._file["cell_lengths"][frames], self._file["cell_angles"][frames])
 
     def close(self) -> None:
         super().close()
         self._file.close()
+
+
+class H5mdReader(Hdf5Reader):
+    """Reads the positions of another program's H5MD file. Times that are fixed steps or without a unit are not known.
+
+    Raises TrajectoryError for a file that is damaged or states no unit of length, InputError for several groups of
+    particles or a `top` that does not fit.
+    """
+
+    def _read_headers(self, top: Path | None) -> None:
+        groups = [g for g in self._file.get("particles", {}).values() if "position/value" in g]
+        if len(groups) != 1:
+            names = ", ".join(g.name.rpartition("/")[2] for g in groups)
+            which = f"several groups of particles ({names}); write one of them alone" if groups else "no positions"
+            raise InputError(f"{self.path} holds {which}.")
+        self._box, position = groups[0].get("box"), groups[0]["position"]
+        self._take_coordinates(position["value"])
+        self.n_frames = len(self._coordinates)
+        nm = nm_per(self._coordinates.attrs.get("unit", ""))
+        if nm is None:
+            raise TrajectoryError(
+                f"{self.path}: its positions state no unit of length that is known; set the attribute `unit` of "
+                f"{self._coordinates.name} to 'nm' or 'Angstrom'."
+            )
+        self._nm = nm
+        self.time_ps, self.times_known = np.arange(self.n_frames, dtype=np.float64), False
+        time = position.get("time")
+        ps = None if time is None or not time.ndim else ps_per(time.attrs.get("unit", ""))
+        if ps is not None:
+            self.time_ps, self.times_known = ps * np.asarray(time[:], dtype=np.float64), True
+            if len(self.time_ps) != self.n_frames:
+                raise TrajectoryError(f"{self.path} is damaged: {self.n_frames} frames, {len(self.time_ps)} times.")
+        elif time is not None:
+            self.notes = ("its times are fixed steps, or state no unit that is known, and are not used.",)
+        self._take_scene(self._scene_of(top), top)
+
+    def _read_cells(self, start: int, stop: int, stride: int) -> Float64Array | None:
+        with damage_reported(self.path):
+            edges = None if self._box is None else self._box.get("edges", self._box.attrs.get("edges"))
+            if edges is None:
+                return None
+            column = edges.get("value") if isinstance(edges, h5py.Group) else None
+            if column is not None:
+                values, unit = np.asarray(column[start:stop:stride]), column.attrs.get("unit")
+            else:
+                one = np.asarray(edges[()])
+                values = np.broadcast_to(one, (len(range(start, stop, stride)), *one.shape))
+                unit = edges.attrs.get("unit") if isinstance(edges, h5py.Dataset) else None
+            nm = self._nm if unit is None else nm_per(unit)
+            if nm is None:
+                raise TrajectoryError(
+                    f"{self.path}: its cell is in {unit!r}, a unit that is not known; write it in nm."
+                )
+            cells = values[..., None] * np.eye(3) if values.ndim == 2 else values
+            return None if not np.any(cells) else np.asarray(cells, dtype=np.float64) * nm
 
 
 def is_plain_h5md(path: Path) -> bool:
@@ -208,16 +273,6 @@ def is_plain_h5md(path: Path) -> bool:
             return "h5md" in file and "coordinates" not in file and "surromd" not in file
     except TrajectoryError:  # its own reader says how it is damaged
         return False
-
-
-def _per_unit(file: h5py.File, name: str, per: Callable[[Any], float | None], path: Path) -> float:
-    """Return what one of a dataset's `units` is in nm or ps, 1 where it states none (MDTraj's convention)."""
-    units = file[name].attrs.get("units")
-    factor = 1.0 if units is None else per(units)
-    if factor is None:
-        shown = units.decode(errors="replace") if isinstance(units, bytes) else units
-        raise TrajectoryError(f"{path}: {name} are in {shown!r}, a unit that is not known; write it in nm and ps.")
-    return factor
 
 
 def _topology_json(scene: Scene) -> str:

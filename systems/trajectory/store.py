@@ -8,6 +8,7 @@ checked, `/surromd/scalars/NAME` (n,) float64, `/surromd/checksums/NAME` (n,) ui
 
 from __future__ import annotations
 
+import hashlib
 import io
 import json
 import uuid
@@ -30,7 +31,6 @@ from systems.files.whole_file import (
     checksum_rows,
     create_whole,
     frame_checksums,
-    frames_digest,
     journal_path,
     refuse_existing,
     sealed,
@@ -371,11 +371,12 @@ class FrameStore:
         self._look_again()
 
     def _look_again(self) -> None:
-        self._digest = frames_digest({name: c[:] for name, c in self._columns.items() if name.startswith(CHECKSUMS)})
+        checksums = {name: column[:] for name, column in self._columns.items() if name.startswith(CHECKSUMS)}
+        self._digest = hashlib.sha256(checksum_rows(checksums))
         self.last_time_ps = float(self._columns["time"][self.n_frames - 1]) if self.n_frames else None
 
     def digest(self) -> str:
-        """Return the hash of all frames written so far, as `frames_digest` makes it of their checksums."""
+        """Return the hash of the checksums of all frames written so far (`TrajectoryReader.digest`)."""
         return self._digest.hexdigest()
 
     @contextmanager

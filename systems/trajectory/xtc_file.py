@@ -103,8 +103,11 @@ class CompanionWriter(TrajectoryWriter):
 
     def _set_length(self, n_frames: int, record: h5py.File) -> None:
         """Make header and file size say `n_frames`."""
-        self._restate(n_frames, record["time"][: min(n_frames, 2)])
-        os.ftruncate(self._fd, self._offset(n_frames, record))
+        times_ps, end = record["time"][: min(n_frames, 2)], self._offset(n_frames, record)
+        if record is self.file and self._atomic.failure is not None:  # HDF5 makes zeros of what could not be read
+            raise self._atomic.failure
+        self._restate(n_frames, times_ps)
+        os.ftruncate(self._fd, end)
 
     def truncate(self, n_frames: int) -> None:
         super().truncate(n_frames)
@@ -123,19 +126,18 @@ class CompanionWriter(TrajectoryWriter):
 class CompanionReader(TrajectoryReader):
     """Reads positions from one file and all else from `NAME.meta.h5`; both are refused unless they fit each other."""
 
-    def _read_companion(self, top: Path | None, *, with_ends: bool) -> npt.NDArray[np.int64]:
-        """Take what the companion says; return where each frame ends `(n_frames,)`, of an XTC file."""
+    def _read_companion(self, top: Path | None) -> None:
         meta = meta_path(self.path)
         with open_hdf5(meta) as file, damage_reported(meta):
             if "surromd" not in file:
                 raise TrajectoryError(f"{meta} is not the record of {self.path.name}; move it to read the DCD alone.")
             self._read_stored(file, meta)
-            ends: npt.NDArray[np.int64] = file[ENDS][: self.n_frames] if with_ends else np.empty(0, dtype=np.int64)
+            if ENDS in file:
+                self._ends: npt.NDArray[np.int64] = file[ENDS][: self.n_frames]
         assert self.scene is not None
         self.n_atoms = self.scene.n_atoms
         if top is not None:
             self.notes = (f"{top} is not used: the file holds its own topology.",)
-        return ends
 
 
 def is_of_xtc(path: Path) -> bool:
@@ -206,7 +208,7 @@ class XtcReader(CompanionReader):
 
     def __init__(self, path: Path, top: Path | None) -> None:
         super().__init__(path)
-        self._ends = self._read_companion(top, with_ends=True)
+        self._read_companion(top)
         end = int(self._ends[-1]) if self.n_frames else 0
         check_size(path, self.n_frames, end, completed=self.record.get("completed") is True)
 

@@ -97,7 +97,7 @@ def test_the_manual_s_table_is_the_one_that_readers_go_by() -> None:
     for each in FORMATS:
         row = rows[each.name]
         assert row["format"].endswith(f"({', '.join(f'`{s}`' for s in each.suffixes)})")
-        assert (row["read by"], row["positions"], row["times"]) == (each.reader, each.positions, each.times)
+        assert (row["read by"], row["times"]) == (each.reader, each.times)
         assert (row["atoms"] != NONE) is each.names_atoms and each.unit_taken in row["unit of length"]
 
 
@@ -197,40 +197,31 @@ def write_netcdf(path: Path, x: np.ndarray, times: np.ndarray, length: bytes, ti
                 variable.scale_factor = np.float32(scale)
 
 
-def test_hdf5_is_read_as_stated(folder: Path, tmp_path: Path, frames: np.ndarray) -> None:
+def test_hdf5_in_other_units_is_refused(folder: Path, tmp_path: Path, frames: np.ndarray) -> None:
     import h5py
 
-    path = tmp_path / "a.h5"
-    path.write_bytes((folder / "mdtraj.h5").read_bytes())
-    with h5py.File(path, "r+") as file:
-        file["coordinates"][:] *= 10.0
-        file["cell_lengths"][:] *= 10.0
-        file["time"][:] *= 1000.0
-        for name, unit in (("coordinates", b"angstroms"), ("cell_lengths", b"angstroms"), ("time", b"femtoseconds")):
+    with open_trajectory(folder / "mdtraj.h5") as reader:
+        assert reader.read() == pytest.approx(frames, abs=1e-5)
+        assert reader.time_ps == pytest.approx(TIMES, rel=1e-5)
+        cells = reader.read_cells(0, 1)
+        assert cells is not None and cells[0] == pytest.approx(BOX, abs=1e-5)
+    for name, unit in (("coordinates", b"angstroms"), ("cell_lengths", b"angstroms"), ("time", b"fortnights")):
+        path = tmp_path / "a.h5"
+        path.write_bytes((folder / "mdtraj.h5").read_bytes())
+        with h5py.File(path, "r+") as file:
             file[name].attrs["units"] = np.bytes_(unit)
-    for one in (path, folder / "mdtraj.h5"):
-        with open_trajectory(one) as reader:
-            assert reader.read() == pytest.approx(frames, abs=1e-5)
-            assert reader.time_ps == pytest.approx(TIMES, rel=1e-5)
-            cells = reader.read_cells(0, 1)
-            assert cells is not None and cells[0] == pytest.approx(BOX, abs=1e-5)
-    with h5py.File(path, "r+") as file:
-        file["time"].attrs["units"] = np.bytes_(b"fortnights")
-    with pytest.raises(TrajectoryError, match="time are in 'fortnights'"):
-        open_trajectory(path)
+        with pytest.raises(TrajectoryError, match=f"{name} are in '{unit.decode()}'"):
+            open_trajectory(path)
 
 
-def test_h5md_with_fixed_steps_and_without_units(folder: Path, tmp_path: Path, frames: np.ndarray) -> None:
+def test_h5md_with_a_fixed_cell_and_without_units(folder: Path, tmp_path: Path, frames: np.ndarray) -> None:
     import h5py
 
     path = tmp_path / "a.h5md"
     path.write_bytes((folder / "mda.h5md").read_bytes())
     with h5py.File(path, "r+") as file:
         (group,) = file["particles"].values()
-        del group["position/time"], group["position/step"], group["box/edges"]
-        group["position/step"] = 5
-        group["position/time"] = 2500.0
-        group["position/time"].attrs.update(unit="fs", offset=5000.0)
+        del group["box/edges"]
         group["box/edges"] = np.diag(10.0 * BOX)
         group["box/edges"].attrs["unit"] = "Angstrom"
     for one in (path, folder / "mda.h5md"):
@@ -242,9 +233,11 @@ def test_h5md_with_fixed_steps_and_without_units(folder: Path, tmp_path: Path, f
             assert not reader.notes
     with h5py.File(path, "r+") as file:
         (group,) = file["particles"].values()
-        del group["position/time"].attrs["unit"]
+        del group["position/time"]
+        group["position/time"] = 2.5
+        group["position/time"].attrs["unit"] = "ps"
     with open_trajectory(path) as reader:
-        assert not reader.times_known and "times state no unit" in reader.notes[0]
+        assert not reader.times_known and "times are fixed steps" in reader.notes[0]
     with h5py.File(path, "r+") as file:
         (group,) = file["particles"].values()
         del group["position/value"].attrs["unit"]
