@@ -125,7 +125,7 @@ def open_trajectory(path: str | Path, *, top: str | Path | None = None) -> Traje
             return xtc_file.XtcReader(path, top)
         if top is None and is_our_topology(topology_path(path)):
             top = topology_path(path)
-    if suffix in (".xtc", ".nc", ".ncdf", ".netcdf"):
+    if suffix in (".xtc", ".trr", ".nc", ".ncdf", ".netcdf"):
         return foreign_readers.StreamReader(path, top)
     if path.name.lower().endswith((*XYZ_SUFFIXES, ".traj")):
         return foreign_readers.AtomsReader(path, top)

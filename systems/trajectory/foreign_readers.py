@@ -21,6 +21,7 @@ from pathlib import Path
 from typing import IO, Any, NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 
 from systems.chemistry.distance_bonds import read_cells
 from systems.chemistry.element_data import element_symbol
@@ -42,6 +43,9 @@ from systems.trajectory.store import Float32Array, Float64Array
 _NM = 0.1
 # Magic, atoms, step, time, nine numbers of the cell, atoms again; then the precision, a float32.
 _XTC_PRECISION = 56
+_TRR_MAGIC = 1993
+# Of the thirteen numbers of its header: the bytes of positions, velocities and forces.
+_TRR_PER_ATOM = (7, 8, 9)
 
 
 def unit_note(format_: Format) -> tuple[str, ...]:
@@ -67,9 +71,11 @@ def check_same_atoms(names: Sequence[str], first: Sequence[str], path: Path, fra
 
 
 @contextlib.contextmanager
-def _linked(path: Path) -> Iterator[Path]:
-    """Make a link to a file in a folder of its own: MDTraj's libraries in C take paths of ASCII alone, and MDAnalysis
-    leaves an index beside each TRR."""
+def _ascii_path(path: Path) -> Iterator[Path]:
+    """Make a link to a file in a folder of its own: MDTraj's libraries in C take paths of ASCII alone."""
+    if str(path).isascii():
+        yield path
+        return
     with tempfile.TemporaryDirectory(prefix="surromd-") as folder:
         link = Path(folder) / f"frames{''.join(path.suffixes[-2:])}"
         link.symlink_to(path.resolve(), target_is_directory=path.is_dir())
@@ -125,7 +131,7 @@ class MdtrajReader(TrajectoryReader):
         try:
             if is_mol2:
                 importlib.import_module("pandas")
-            with contextlib.nullcontext(path) if str(path).isascii() else _linked(path) as seen:
+            with _ascii_path(path) as seen:
                 return mdtraj.load(str(seen), **({} if topology is None else {"top": topology}))
         except ImportError as error:
             lacking = error.name or "a package"
@@ -141,9 +147,7 @@ class MdtrajReader(TrajectoryReader):
             lines = file.read().splitlines()
         if self._format.name == "GRO":
             each = self.n_atoms + 3
-            rows = [line[:15] for k, line in enumerate(lines) if 2 <= k % each < each - 1][
-                : self.n_frames * self.n_atoms
-            ]
+            rows = [line[:15] for k, line in enumerate(lines[: each * self.n_frames]) if 2 <= k % each < each - 1]
             # Where one title states no time MDTraj counts frames.
             self.times_known = all(_GRO_TIME.search(line) for line in lines[: self.n_frames * each : each])
         else:
@@ -161,9 +165,10 @@ class MdtrajReader(TrajectoryReader):
 
 
 class StreamReader(TrajectoryReader):
-    """An XTC file of another program, or a NetCDF file of Amber's convention, read by MDTraj block by block.
+    """An XTC or TRR file of another program, or a NetCDF file of Amber's convention, read by MDTraj block by block.
 
-    Raises TrajectoryError for what it cannot read, InputError when `top` does not fit.
+    TRR frames without positions are left out. Raises TrajectoryError for what it cannot read, InputError when `top`
+    does not fit.
     """
 
     def __init__(self, path: Path, top: Path | None) -> None:
@@ -171,12 +176,12 @@ class StreamReader(TrajectoryReader):
 
         super().__init__(path)
         self._links = contextlib.ExitStack()
-        self._is_xtc = format_of(path).name == "XTC"
-        self._nm = 1.0 if self._is_xtc else _NM
+        self._format = format_of(path)
+        self._nm = _NM if self._format.name == "NetCDF (Amber)" else 1.0
+        self._kept: IntArray | None = None
         times = []
         try:
-            seen = path if str(path).isascii() else self._links.enter_context(_linked(path))
-            self._file = mdtraj.open(str(seen))
+            self._file = mdtraj.open(str(self._links.enter_context(_ascii_path(path))))
             self.n_atoms = int(self._file.read(n_frames=1)[0].shape[1])
             self._file.seek(0)
             while True:
@@ -189,14 +194,20 @@ class StreamReader(TrajectoryReader):
         except Exception as error:  # MDTraj raises several kinds
             self._links.close()
             raise TrajectoryError(f"{path} cannot be read: {first_line(error)}.") from error
-        if self._is_xtc:
+        self._has_cell = True
+        if self._format.name == "XTC":
             self.grid_nm = _xtc_grid_nm(path)
+        elif self._format.name == "TRR":
+            has, self._has_cell = _trr_frames(path)
+            if not has.all():
+                self._kept, self.time_ps = np.flatnonzero(has), self.time_ps[has]
+                self.notes = (f"{(~has).sum()} frames hold no positions and are left out.",)
         else:
             self._check_units(self._file._handle.variables)
         self.n_frames = len(self.time_ps)
         if not self.n_frames:
             raise InputError(f"{path} holds no positions.")
-        self.notes = counted_note(self.time_ps) if self.times_known else ()
+        self.notes += counted_note(self.time_ps) if self.times_known else ()
         self._take_scene(self._scene_of(top), top)
 
     def _check_units(self, variables: Any) -> None:
@@ -210,12 +221,14 @@ class StreamReader(TrajectoryReader):
 
     def _stored(self, start: int, stop: int) -> list[Any]:
         """Return what MDTraj reads of frames: positions and times, then steps and boxes, or lengths and angles."""
+        kept = np.arange(start, stop) if self._kept is None else self._kept[start:stop]
         try:
-            self._file.seek(start)
-            return list(self._file.read(n_frames=stop - start))
+            self._file.seek(int(kept[0]))
+            stored = self._file.read(n_frames=int(kept[-1] - kept[0]) + 1)
         except Exception as error:  # MDTraj raises several kinds
             reason = first_line(error)
             raise TrajectoryError(f"{self.path} is damaged in frames {start} to {stop} ({reason}).") from error
+        return [x if x is None or self._kept is None else np.asarray(x)[kept - kept[0]] for x in stored]
 
     def _read(self, start: int, stop: int, stride: int) -> Float32Array:
         block = max(_PASS_FRAMES // stride, 1) * stride
@@ -225,12 +238,13 @@ class StreamReader(TrajectoryReader):
     def _read_cells(self, start: int, stop: int, stride: int) -> Float64Array | None:
         if start >= stop:
             return np.empty((0, 3, 3))
-        _, _, lengths, cells = self._stored(start, stop)
-        if cells is None:
+        stored = self._stored(start, stop)
+        if stored[3] is None or not self._has_cell:
             return None
-        if self._is_xtc:
-            return cells[::stride].astype(np.float64) if cells.any() else None
-        return read_cells(np.asarray(lengths)[::stride] * _NM, np.asarray(cells)[::stride])
+        cells = np.asarray(stored[3], dtype=np.float64)[::stride]
+        if self._format.name == "NetCDF (Amber)":
+            return read_cells(np.asarray(stored[2])[::stride] * _NM, cells)
+        return cells if cells.any() else None
 
     def close(self) -> None:
         super().close()
@@ -250,6 +264,29 @@ def _xtc_grid_nm(path: Path) -> float | None:
     return 1.0 / precision if np.isfinite(precision) and precision > 0 else None
 
 
+def _trr_frames(path: Path) -> tuple[npt.NDArray[np.bool_], bool]:
+    """Return which frames of a TRR file hold positions `(n_frames,)`, and whether the first states a cell, by their
+    headers: MDTraj gives memory that nobody set for the others. Raises TrajectoryError for a damaged file."""
+    found, has_cell, size = list[bool](), False, path.stat().st_size
+    with path.open("rb") as file:
+        while (at := file.tell()) < size:
+            try:
+                magic, _, length = np.frombuffer(file.read(12), ">i4").tolist()
+                file.seek(-(-length // 4) * 4, 1)
+                sizes = np.frombuffer(file.read(52), ">i4").tolist()
+                of_atoms = next((sizes[k] for k in _TRR_PER_ATOM if sizes[k]), 0)
+                is_double = sizes[2] == 72 if sizes[2] else of_atoms == 24 * sizes[10]
+                # Behind the header: time and lambda, box, virial, pressure, positions, velocities and forces.
+                file.seek((16 if is_double else 8) + sum(sizes[k] for k in (2, 3, 4, *_TRR_PER_ATOM)), 1)
+            except (ValueError, IndexError):
+                magic = 0
+            if magic != _TRR_MAGIC or not at < file.tell() <= size:
+                raise TrajectoryError(f"{path} is damaged or cut short in frame {len(found)}.")
+            has_cell |= not found and sizes[2] > 0
+            found.append(sizes[_TRR_PER_ATOM[0]] > 0)
+    return np.array(found, dtype=bool), has_cell
+
+
 class MdanalysisReader(TrajectoryReader):
     """A format of MDAnalysis, read frame by frame. Raises TrajectoryError; InputError for a `top` that does not fit."""
 
@@ -261,29 +298,22 @@ class MdanalysisReader(TrajectoryReader):
         self._format = format_of(path)
         self.notes = unit_note(self._format)
         self._kept: IntArray | None = None
-        self._links = contextlib.ExitStack()
         stated = None
         if top is not None:
             stated = scene_from_structure(top, name=path.stem)
         elif self._format.names_atoms:
             stated = scene_from_universe(path, name=path.stem)
-        is_trr = self._format.name == "TRR"
-        # nm as they are stored: to Å and back would round them twice.
-        self._nm = 1.0 if is_trr else _NM
         try:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")
-                seen = str(self._links.enter_context(_linked(path)) if is_trr else path)
                 size = {} if stated is None else {"n_atoms": stated.n_atoms}
-                kind = get_reader_for(seen, format=self._format.mda)
-                self._reader: Any = kind(seen, convert_units=not is_trr, **size)
+                kind = get_reader_for(str(path), format=self._format.mda)
+                self._reader: Any = kind(str(path), convert_units=True, **size)
                 self.n_frames, self.n_atoms = int(self._reader.n_frames), int(self._reader.n_atoms)
                 self.time_ps, self.times_known = self._times()
         except InputError:
-            self._links.close()
             raise
         except Exception as error:  # each of its readers raises its own kinds
-            self._links.close()
             # Of a format that it does not know it lists all others in the lines that follow.
             why = first_line(error).partition(". The FORMATs")[0]
             raise TrajectoryError(
@@ -308,23 +338,19 @@ class MdanalysisReader(TrajectoryReader):
             self._kept = np.flatnonzero(has)
             self.notes += (f"{(~has).sum()} frames hold no positions and are left out.",)
             self.n_frames, times = int(has.sum()), times[has]
-        if known:
-            self.notes += counted_note(times)
         return times, known
 
     def _read(self, start: int, stop: int, stride: int) -> Float32Array:
         out = np.empty((len(range(start, stop, stride)), self.n_atoms, 3), dtype=np.float32)
         for k, frame in enumerate(self._frames(start, stop, stride)):
-            out[k] = frame.positions * np.float32(self._nm)
+            out[k] = frame.positions * np.float32(_NM)
         return out
 
     def _read_cells(self, start: int, stop: int, stride: int) -> Float64Array | None:
-        if self._format.name == "TRR" and not _trr_has_cell(self.path):
-            return None
         cells = [frame.triclinic_dimensions for frame in self._frames(start, stop, stride)]
         if any(c is None or not np.any(c) for c in cells):
             return None
-        return np.asarray(cells, dtype=np.float64).reshape(-1, 3, 3) * self._nm
+        return np.asarray(cells, dtype=np.float64).reshape(-1, 3, 3) * _NM
 
     def _frames(self, start: int, stop: int, stride: int) -> Any:
         return (self._reader[k if self._kept is None else int(self._kept[k])] for k in range(start, stop, stride))
@@ -332,15 +358,6 @@ class MdanalysisReader(TrajectoryReader):
     def close(self) -> None:
         super().close()
         self._reader.close()
-        self._links.close()
-
-
-def _trr_has_cell(path: Path) -> bool:
-    """Return whether the first frame of a TRR file states a cell: where not, readers give memory that nobody set."""
-    with path.open("rb") as file:
-        length = int.from_bytes(file.read(12)[8:], "big")
-        file.seek(-(-length // 4) * 4 + 8, 1)
-        return int.from_bytes(file.read(4), "big") > 0
 
 
 # ---- XYZ and ASE ----------------------------------------------------------------------------------------------------

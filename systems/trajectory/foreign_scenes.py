@@ -74,7 +74,7 @@ FORMATS = (
     Format("XYZ, extended XYZ", XYZ_SUFFIXES, "surromd", NONE, True),
     Format("ASE", (".traj",), "ase", NONE, True),
     Format("XTC", (".xtc",), "MDTraj", EVERY, False),
-    Format("TRR", (".trr",), "MDAnalysis", EVERY, False),
+    Format("TRR", (".trr",), "MDTraj", EVERY, False),
     Format("NetCDF (Amber)", (".nc", ".ncdf", ".netcdf"), "MDTraj", SOME, False),
     Format("PDB", (".pdb", ".pdb.gz"), "MDTraj", NONE, True),
     Format("PDBx/mmCIF", (".pdbx", ".cif", ".mmcif", ".pdbx.gz", ".cif.gz", ".mmcif.gz"), "MDTraj", NONE, True),

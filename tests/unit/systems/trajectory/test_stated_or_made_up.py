@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import gzip
+import sys
 import warnings
 from pathlib import Path
 
+import h5py
 import numpy as np
 import pytest
 
 from format_table import format_rows
+from systems.chemistry.distance_bonds import bonds_by_distance
+from systems.chemistry.graph import molecule_key
 from systems.errors import InputError, TrajectoryError
 from systems.scene import Scene
 from systems.trajectory.codec import open_trajectory
@@ -48,6 +52,9 @@ def folder(tmp_path_factory: pytest.TempPathFactory, alanine_dipeptide: Scene, f
             with mda.Writer(str(path / f"mda.{suffix}"), n_atoms=22) as writer:
                 for _ in universe.trajectory:
                     writer.write(universe.atoms)
+    with h5py.File(path / "mda.h5md") as whole, h5py.File(path / "mda.h5", "w") as copy:
+        for part in whole:
+            whole.copy(part, copy)
     from openmm import app, unit
 
     topology, edges = app.PDBFile(str(path / "top.pdb")).topology, BOX * unit.nanometer
@@ -66,10 +73,14 @@ def folder(tmp_path_factory: pytest.TempPathFactory, alanine_dipeptide: Scene, f
     ["mdtraj.xtc", "mdtraj.trr", "mdtraj.nc", "mdtraj.dcd", "mdtraj.pdb", "mdtraj.xyz", "mdtraj.gro", "mdtraj.mdcrd",
      "mdtraj.h5", "mdtraj.lammpstrj", "mda.h5md", "mda.xyz", "mda.trz", "mda.nc", "openmm.dcd", "openmm.xtc"],
 )  # fmt: skip
-def test_readers_go_by_the_table(folder: Path, frames: np.ndarray, name: str) -> None:
+def test_readers_go_by_the_table(folder: Path, frames: np.ndarray, alanine_dipeptide: Scene, name: str) -> None:
     line = format_of(folder / name)
     with open_trajectory(folder / name, top=folder / "top.pdb") as reader:
         assert reader.read() == pytest.approx(frames, abs=6e-4)
+        assert np.array_equal(reader.read(1, 5, 2), reader.read()[1:5:2])
+        assert reader.scene is not None and reader.record == {} and reader.flags is None
+        assert reader.scene.elements == alanine_dipeptide.elements
+        assert np.array_equal(reader.scene.bonds, alanine_dipeptide.bonds)
         if line.times == EVERY:
             assert reader.times_known
         if line.times == NONE:
@@ -159,6 +170,9 @@ def test_trr_frames_without_positions_are_left_out(tmp_path: Path, frames: np.nd
             out.write(x.copy(), x.copy(), None, box, k, 2.0 * k, 0.0, 22)
     with open_trajectory(tmp_path / "whole.trr") as reader:
         assert reader.n_frames == N and not reader.notes
+    path.write_bytes(path.read_bytes()[:-10])
+    with pytest.raises(TrajectoryError, match=r"cut short|cannot be read"):
+        open_trajectory(path)
     with TRRFile(str(tmp_path / "none.trr"), "w") as out:
         out.write(None, frames[0].copy(), None, box, 0, 0.0, 0.0, 22)
     with pytest.raises(InputError, match="holds no positions"):
@@ -198,8 +212,6 @@ def write_netcdf(path: Path, x: np.ndarray, times: np.ndarray, length: bytes, ti
 
 
 def test_hdf5_in_other_units_is_refused(folder: Path, tmp_path: Path, frames: np.ndarray) -> None:
-    import h5py
-
     with open_trajectory(folder / "mdtraj.h5") as reader:
         assert reader.read() == pytest.approx(frames, abs=1e-5)
         assert reader.time_ps == pytest.approx(TIMES, rel=1e-5)
@@ -215,8 +227,6 @@ def test_hdf5_in_other_units_is_refused(folder: Path, tmp_path: Path, frames: np
 
 
 def test_h5md_with_a_fixed_cell_and_without_units(folder: Path, tmp_path: Path, frames: np.ndarray) -> None:
-    import h5py
-
     path = tmp_path / "a.h5md"
     path.write_bytes((folder / "mda.h5md").read_bytes())
     with h5py.File(path, "r+") as file:
@@ -224,7 +234,7 @@ def test_h5md_with_a_fixed_cell_and_without_units(folder: Path, tmp_path: Path, 
         del group["box/edges"]
         group["box/edges"] = np.diag(10.0 * BOX)
         group["box/edges"].attrs["unit"] = "Angstrom"
-    for one in (path, folder / "mda.h5md"):
+    for one in (path, folder / "mda.h5md", folder / "mda.h5"):
         with open_trajectory(one, top=folder / "top.pdb") as reader:
             assert reader.read(1, 5, 2) == pytest.approx(frames[1:5:2], abs=1e-6)
             assert reader.times_known and reader.time_ps == pytest.approx(TIMES)
@@ -243,6 +253,71 @@ def test_h5md_with_a_fixed_cell_and_without_units(folder: Path, tmp_path: Path, 
         del group["position/value"].attrs["unit"]
     with pytest.raises(TrajectoryError, match="state no unit of length"):
         open_trajectory(path)
+
+
+def test_an_xyz_file_is_its_own_topology(folder: Path, alanine_dipeptide: Scene) -> None:
+    """CA in capitals is an alpha carbon, not calcium; bonds come from distances, orders from valence."""
+    with open_trajectory(folder / "mdtraj.xyz") as reader:
+        assert reader.scene is not None
+        assert reader.scene.elements == alanine_dipeptide.elements
+        assert np.array_equal(reader.scene.bonds, alanine_dipeptide.bonds)
+        assert molecule_key(reader.scene) == molecule_key(alanine_dipeptide)
+
+
+def test_formats_without_topology_say_so(folder: Path) -> None:
+    with open_trajectory(folder / "mdtraj.nc") as reader:
+        assert reader.scene is None and reader.n_frames == N
+    with pytest.raises(TrajectoryError, match=r"mdtraj\.mdcrd cannot be read: .*`top"):
+        open_trajectory(folder / "mdtraj.mdcrd")
+
+
+def test_an_ase_trajectory_that_cannot_be_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "x.traj").write_bytes(b"- of Ulm")
+    with monkeypatch.context() as patch:
+        patch.setitem(sys.modules, "ase.io.trajectory", None)
+        with pytest.raises(TrajectoryError, match=r"pip install ase.*ase convert"):
+            open_trajectory(tmp_path / "x.traj")
+    pytest.importorskip("ase")
+    with pytest.raises(TrajectoryError, match=r"x\.traj cannot be read by ase"):
+        open_trajectory(tmp_path / "x.traj")
+
+
+def test_a_topology_of_other_atoms_is_refused(folder: Path, tmp_path: Path) -> None:
+    smaller = mdtraj.load(str(folder / "top.pdb"))
+    smaller.atom_slice(range(10)).save_pdb(str(tmp_path / "small.pdb"))
+    for name in ("mdtraj.xtc", "mdtraj.dcd", "mda.h5md"):
+        with pytest.raises(InputError, match=r"small\.pdb has 10 atoms"):
+            open_trajectory(folder / name, top=tmp_path / "small.pdb")
+
+
+def test_bonds_by_distance() -> None:
+    water_and_argon = np.array([[0, 0, 0], [0.096, 0, 0], [-0.024, 0.093, 0], [0.4, 0, 0]])
+    assert bonds_by_distance(["O", "H", "H", "Ar"], water_and_argon).tolist() == [[0, 1], [0, 2]]
+    close_hydrogens = np.array([[0, 0, 0], [0.07, 0, 0], [0.15, 0, 0]])
+    assert bonds_by_distance(["C", "H", "C"], close_hydrogens).tolist() == [[0, 1], [0, 2]], "H belongs to the nearest"
+
+
+def test_cells_are_read(tmp_path: Path, alanine_dipeptide: Scene, frames: np.ndarray) -> None:
+    box = np.array([[3.0, 0, 0], [0.0, 2.0, 0], [0.5, 0.3, 4.0]])
+    made = mdtraj.Trajectory(frames, alanine_dipeptide.to_mdtraj_topology(), time=TIMES)
+    made.unitcell_vectors = np.repeat(box[None], N, axis=0)
+    for suffix in ("xtc", "nc"):
+        path = tmp_path / f"c.{suffix}"
+        made.save(str(path))
+        with open_trajectory(path) as reader:
+            cells = reader.read_cells(2, 8, 3)
+            assert cells is not None and cells == pytest.approx(np.repeat(box[None], 2, axis=0), abs=2e-4)
+
+
+def test_a_psf_is_a_topology(shared_data: Path) -> None:
+    """CHARMM's adenylate kinase: 3,341 atoms, bonds from the PSF, positions from the first frame."""
+    adk = shared_data / "adk"
+    with open_trajectory(adk / "adk_dims.dcd", top=adk / "adk.psf") as reader:
+        assert reader.scene is not None
+        universe = mda.Universe(str(adk / "adk.psf"), str(adk / "adk_dims.dcd"))
+        assert len(reader.scene.bonds) == len(universe.bonds)
+        assert reader.scene.positions_nm == pytest.approx(0.1 * universe.atoms.positions, abs=1e-5)
+        assert reader.times_known and reader.time_ps[1] - reader.time_ps[0] == pytest.approx(1.0, rel=1e-4)
 
 
 def test_hdf5_topologies_without_bonds(folder: Path, tmp_path: Path) -> None:
@@ -389,7 +464,8 @@ def test_elements_of_ase_that_change_are_refused(tmp_path: Path, frames: np.ndar
             for k, x in enumerate(frames):
                 out.write(ase.Atoms(later if k > 2 else symbols, positions=10.0 * x))
     with open_trajectory(tmp_path / "same.traj") as reader:
-        assert reader.read() == pytest.approx(frames, abs=1e-6)
+        assert reader.read() == pytest.approx(frames, abs=1e-6) and not reader.times_known
+        assert reader.scene is not None and molecule_key(reader.scene) == molecule_key(alanine_dipeptide)
     with pytest.raises(TrajectoryError, match="frame 3 lists other"):
         open_trajectory(tmp_path / "moved.traj")
 
