@@ -13,7 +13,7 @@ from surrogate.verbs.options import Trajectories
 from systems.errors import InputError
 from systems.trajectory.checkpoint import checkpoint_path, frames_in
 from systems.trajectory.codec import WRITTEN
-from systems.trajectory.companion_writer import refuse_other_topology
+from systems.trajectory.companion_writer import refuse_other_companions
 
 
 def check_outputs(
@@ -38,7 +38,7 @@ def check_outputs(
         if path.exists() and not (resume or overwrite):
             raise InputError(f"{path} exists; add `overwrite=True` to replace it, or choose another name.")
         if path.suffix.lower() in WRITTEN and suffixes == WRITTEN and not resume:
-            refuse_other_topology(path)
+            refuse_other_companions(path)
 
 
 @contextmanager

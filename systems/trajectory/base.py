@@ -15,9 +15,16 @@ import numpy as np
 import numpy.typing as npt
 
 from systems.errors import InputError, SurromdError, TrajectoryError
-from systems.files.whole_file import Checksums, OutputLock, checksum_rows, frame_checksums, refuse_existing
+from systems.files.whole_file import (
+    Checksums,
+    OutputLock,
+    checksum_rows,
+    create_whole,
+    frame_checksums,
+    refuse_existing,
+)
 from systems.scene import Scene
-from systems.trajectory.companion_writer import refuse_other_topology, topology_bytes, topology_path, write_topology
+from systems.trajectory.companion_writer import refuse_other_companions, topology_bytes, topology_path
 from systems.trajectory.store import (
     CHECKSUMS,
     FRAMES,
@@ -61,9 +68,10 @@ class TrajectoryWriter(FrameStore, ABC):
         try:
             if not append:
                 refuse_existing(path, overwrite)
-                refuse_other_topology(path, topology, overwrite=overwrite)
+                refuse_other_companions(path)
                 create_store(store, scene, record, self._lay_out, columns, overwrite=overwrite, run_id=run_id)
-                write_topology(path, topology)
+                if topology:
+                    create_whole(pdb, topology)
                 self._begin(path, scene)
         except SurromdError:
             for file in made:
@@ -77,7 +85,8 @@ class TrajectoryWriter(FrameStore, ABC):
             self.scene = scene
             self._adopt()
             if append:
-                write_topology(path, topology)
+                if topology:
+                    create_whole(pdb, topology)
                 if new := {key: value for key, value in record.items() if key not in self.record}:
                     self.update_record(new)
         except BaseException:

@@ -68,9 +68,9 @@ def open_writer(
     from systems.trajectory.xtc_file import XtcWriter
 
     lock = None if locked else OutputLock(path)
-    kinds: dict[str, type[TrajectoryWriter]] = {".dcd": DcdWriter, ".xtc": XtcWriter}
+    writers: dict[str, type[TrajectoryWriter]] = {".dcd": DcdWriter, ".xtc": XtcWriter}
     try:
-        writer = kinds.get(suffix, Hdf5Writer)(
+        writer = writers.get(suffix, Hdf5Writer)(
             path, scene, record, append=append, overwrite=overwrite, columns=columns, run_id=run_id
         )
     except BaseException:

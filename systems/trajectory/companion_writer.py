@@ -10,7 +10,6 @@ from __future__ import annotations
 from pathlib import Path
 
 from systems.errors import InputError, TrajectoryError
-from systems.files.whole_file import create_whole
 from systems.prepare.structure_text import encode, pdb_atom
 from systems.scene import Scene
 
@@ -18,7 +17,6 @@ MOST_ATOMS = 99_999
 # Between these a coordinate in Å fits its columns.
 _LEAST_A, _MOST_A = -999.999, 9999.999
 _OURS = b"REMARK   1 surromd scene"
-_TRAJECTORIES = (".h5", ".hdf5", ".dcd", ".xtc")
 POSITIONS_ALONE = (".dcd", ".xtc")
 
 
@@ -75,9 +73,8 @@ def topology_bytes(scene: Scene) -> bytes:
     return pdb_text(scene).encode() if scene.n_atoms <= MOST_ATOMS else b""
 
 
-def refuse_other_topology(trajectory: Path, topology: bytes = b"", *, overwrite: bool = True) -> None:
-    """Raise TrajectoryError where `NAME.meta.h5` is of another trajectory, or `NAME.pdb` is another program's, or not
-    `topology` and still needed: beside another trajectory of that name, or without `overwrite`."""
+def refuse_other_companions(trajectory: Path) -> None:
+    """Raise TrajectoryError where `NAME.pdb` is another program's, or `NAME.meta.h5` is of another trajectory."""
     pdb, suffix = topology_path(trajectory), trajectory.suffix.lower()
     if pdb.exists() and not is_our_topology(pdb):
         raise TrajectoryError(
@@ -86,22 +83,3 @@ def refuse_other_topology(trajectory: Path, topology: bytes = b"", *, overwrite:
     for other in (trajectory.with_suffix(s) for s in POSITIONS_ALONE if suffix in POSITIONS_ALONE and s != suffix):
         if other.exists() and meta_path(other).exists():
             raise TrajectoryError(f"{meta_path(other)} is the record of {other.name}; choose another name.")
-    if not pdb.exists() or not topology or _atoms(pdb.read_bytes()) == _atoms(topology):
-        return
-    others = [trajectory.with_suffix(s) for s in _TRAJECTORIES if s != trajectory.suffix.lower()]
-    beside = next((other for other in others if other.exists()), None)
-    if beside is not None:
-        raise TrajectoryError(f"{pdb} is the topology of {beside.name}, of other atoms; choose another name.")
-    if not overwrite:
-        raise TrajectoryError(f"{pdb} exists already, of other atoms; overwrite it, or choose another name.")
-
-
-def write_topology(trajectory: Path, topology: bytes) -> None:
-    """Write `NAME.pdb`, where there is a topology. Raises StorageError."""
-    if topology:
-        create_whole(topology_path(trajectory), topology)
-
-
-def _atoms(pdb: bytes) -> list[bytes]:
-    """Return a file's atoms in order, without their positions."""
-    return [line[:30] + line[54:] for line in pdb.splitlines() if line.startswith((b"ATOM", b"HETATM"))]

@@ -160,7 +160,7 @@ def cells_of_blocks(
     """Return box vectors `(n, 3, 3)` nm of unit-cell blocks `(n, 14)`, None of such as hold zeros.
 
     Between the lengths stand angles in degrees (most programs), their cosines (NAMD), or the elements of CHARMM's
-    symmetric shape matrix in Å (version 25 on), whose rows are the box vectors: it is known by numbers that are no
+    symmetric shape matrix in Å (version 25 on), whose rows are the box vectors: recognised by numbers that are no
     angles. Raises ValueError where the numbers are none of the three.
     """
     raw = np.ascontiguousarray(blocks[:, 1:13]).view(f"{byte_order}f8").astype(np.float64)

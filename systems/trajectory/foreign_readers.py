@@ -43,9 +43,6 @@ from systems.trajectory.store import Float32Array, Float64Array
 _NM = 0.1
 # Magic, atoms, step, time, nine numbers of the cell, atoms again; then the precision, a float32.
 _XTC_PRECISION = 56
-_TRR_MAGIC = 1993
-# Of the thirteen numbers of its header: the bytes of positions, velocities and forces.
-_TRR_PER_ATOM = (7, 8, 9)
 
 
 def unit_note(format_: Format) -> tuple[str, ...]:
@@ -59,7 +56,7 @@ def counted_note(time_ps: Float64Array) -> tuple[str, ...]:
     """Return the line on times `(n_frames,)` that are what MDTraj writes where nobody stated any."""
     if len(time_ps) < 3 or not np.array_equal(time_ps, np.arange(len(time_ps))):
         return ()
-    return ("its times are 0, 1, 2, ... ps, which MDTraj also writes where it was told none; if so, state `dt_ps`.",)
+    return ("its times are 0, 1, 2, ... ps, which MDTraj also writes where none were given; if so, state `dt_ps`.",)
 
 
 def check_same_atoms(names: Sequence[str], first: Sequence[str], path: Path, frame: int) -> None:
@@ -96,7 +93,20 @@ _PASS_FRAMES = 4096
 _GRO_TIME = re.compile(r"t= *\d+\.\d+")  # as MDTraj looks for it
 
 
-class MdtrajReader(TrajectoryReader):
+class _InMemory(TrajectoryReader):
+    """Holds all positions `(n, n_atoms, 3)` nm and box vectors `(n, 3, 3)` nm."""
+
+    _positions: Float32Array
+    _cells: Float64Array | None
+
+    def _read(self, start: int, stop: int, stride: int) -> Float32Array:
+        return self._positions[start:stop:stride].copy()
+
+    def _read_cells(self, start: int, stop: int, stride: int) -> Float64Array | None:
+        return None if self._cells is None else self._cells[start:stop:stride].copy()
+
+
+class MdtrajReader(_InMemory):
     """A format that MDTraj reads, whole into memory.
 
     Raises TrajectoryError for what MDTraj cannot read, InputError when `top` is needed or does not fit.
@@ -107,17 +117,18 @@ class MdtrajReader(TrajectoryReader):
         self._format = format_of(path)
         self.notes = unit_note(self._format)
         stated = None if top is None else scene_from_structure(top, name=path.stem)
-        self._whole = self._load(None if stated is None or self._format.names_atoms else stated.to_mdtraj_topology())
-        self.n_frames, self.n_atoms = self._whole.n_frames, self._whole.n_atoms
-        self.time_ps = np.asarray(self._whole.time, dtype=np.float64)
+        whole = self._load(None if stated is None or self._format.names_atoms else stated.to_mdtraj_topology())
+        self._positions = np.asarray(whole.xyz, dtype=np.float32)
+        cells = whole.unitcell_vectors
+        self._cells = None if cells is None else np.asarray(cells, dtype=np.float64)
+        self.n_frames, self.n_atoms = whole.n_frames, whole.n_atoms
+        self.time_ps = np.asarray(whole.time, dtype=np.float64)
         self.times_known = self._format.times != NONE
         if self._format.name in ("PDB", "GRO"):
             self._check_text()
         if stated is None and self.n_frames:
-            made = scene_from_mdtraj_topology(
-                self._whole.topology, self._read(0, 1, 1)[0], name=path.stem, source=path.name
-            )
-            stated = bonds_completed(made, self._read_cells(0, 1, 1))
+            made = scene_from_mdtraj_topology(whole.topology, self._positions[0], name=path.stem, source=path.name)
+            stated = bonds_completed(made, self._cells)
         self._take_scene(stated, top)
 
     def _load(self, topology: Any) -> Any:
@@ -136,7 +147,7 @@ class MdtrajReader(TrajectoryReader):
         except ImportError as error:
             lacking = error.name or "a package"
             raise TrajectoryError(f"{path} cannot be read: MDTraj needs {lacking}, which is not installed.") from error
-        except Exception as error:  # each MDTraj reader raises its own kinds
+        except Exception as error:  # each MDTraj reader raises errors of its own
             needs = topology is None and not self._format.names_atoms
             hint = " (a format without topology: give one with `top`)" if needs else ""
             raise TrajectoryError(f"{path} cannot be read: {first_line(error)}{hint}.") from error
@@ -156,13 +167,6 @@ class MdtrajReader(TrajectoryReader):
         for k in range(1, self.n_frames):
             check_same_atoms(rows[k * n : (k + 1) * n], rows[:n], self.path, k)
 
-    def _read(self, start: int, stop: int, stride: int) -> Float32Array:
-        return np.asarray(self._whole.xyz[start:stop:stride], dtype=np.float32).copy()
-
-    def _read_cells(self, start: int, stop: int, stride: int) -> Float64Array | None:
-        cells = self._whole.unitcell_vectors
-        return None if cells is None else np.asarray(cells[start:stop:stride], dtype=np.float64)
-
 
 class StreamReader(TrajectoryReader):
     """An XTC or TRR file of another program, or a NetCDF file of Amber's convention, read by MDTraj block by block.
@@ -179,9 +183,10 @@ class StreamReader(TrajectoryReader):
         self._format = format_of(path)
         self._nm = _NM if self._format.name == "NetCDF (Amber)" else 1.0
         self._kept: IntArray | None = None
-        times = []
+        self._has_cell, times = True, []
         try:
-            self._file = mdtraj.open(str(self._links.enter_context(_ascii_path(path))))
+            seen = self._links.enter_context(_ascii_path(path))
+            self._file = mdtraj.open(str(seen))
             self.n_atoms = int(self._file.read(n_frames=1)[0].shape[1])
             self._file.seek(0)
             while True:
@@ -191,18 +196,17 @@ class StreamReader(TrajectoryReader):
                 times.append(np.asarray(time, dtype=np.float64))
             self.times_known = bool(times)
             self.time_ps = np.concatenate(times) if times else np.arange(len(self._file), dtype=np.float64)
-        except Exception as error:  # MDTraj raises several kinds
+            if self._format.name == "TRR":
+                has, self._has_cell = _trr_frames(seen)
+                self._kept, self.time_ps = np.flatnonzero(has), self.time_ps[has]
+                if not has.all():
+                    self.notes = (f"{(~has).sum()} frames hold no positions and are left out.",)
+        except Exception as error:  # MDTraj raises errors of many classes
             self._links.close()
             raise TrajectoryError(f"{path} cannot be read: {first_line(error)}.") from error
-        self._has_cell = True
         if self._format.name == "XTC":
             self.grid_nm = _xtc_grid_nm(path)
-        elif self._format.name == "TRR":
-            has, self._has_cell = _trr_frames(path)
-            if not has.all():
-                self._kept, self.time_ps = np.flatnonzero(has), self.time_ps[has]
-                self.notes = (f"{(~has).sum()} frames hold no positions and are left out.",)
-        else:
+        if self._format.name == "NetCDF (Amber)":
             self._check_units(self._file._handle.variables)
         self.n_frames = len(self.time_ps)
         if not self.n_frames:
@@ -225,7 +229,7 @@ class StreamReader(TrajectoryReader):
         try:
             self._file.seek(int(kept[0]))
             stored = self._file.read(n_frames=int(kept[-1] - kept[0]) + 1)
-        except Exception as error:  # MDTraj raises several kinds
+        except Exception as error:  # MDTraj raises errors of many classes
             reason = first_line(error)
             raise TrajectoryError(f"{self.path} is damaged in frames {start} to {stop} ({reason}).") from error
         return [x if x is None or self._kept is None else np.asarray(x)[kept - kept[0]] for x in stored]
@@ -265,26 +269,16 @@ def _xtc_grid_nm(path: Path) -> float | None:
 
 
 def _trr_frames(path: Path) -> tuple[npt.NDArray[np.bool_], bool]:
-    """Return which frames of a TRR file hold positions `(n_frames,)`, and whether the first states a cell, by their
-    headers: MDTraj gives memory that nobody set for the others. Raises TrajectoryError for a damaged file."""
-    found, has_cell, size = list[bool](), False, path.stat().st_size
+    """Return which frames of a TRR file hold positions `(n_frames,)`, and whether the first states a cell: MDTraj gives
+    memory that nobody set for the others. Raises OSError."""
+    from MDAnalysis.lib.formats.libmdaxdr import TRRFile
+
+    with TRRFile(str(path)) as frames:
+        has = np.array([frame.hasx for frame in frames], dtype=bool)
     with path.open("rb") as file:
-        while (at := file.tell()) < size:
-            try:
-                magic, _, length = np.frombuffer(file.read(12), ">i4").tolist()
-                file.seek(-(-length // 4) * 4, 1)
-                sizes = np.frombuffer(file.read(52), ">i4").tolist()
-                of_atoms = next((sizes[k] for k in _TRR_PER_ATOM if sizes[k]), 0)
-                is_double = sizes[2] == 72 if sizes[2] else of_atoms == 24 * sizes[10]
-                # Behind the header: time and lambda, box, virial, pressure, positions, velocities and forces.
-                file.seek((16 if is_double else 8) + sum(sizes[k] for k in (2, 3, 4, *_TRR_PER_ATOM)), 1)
-            except (ValueError, IndexError):
-                magic = 0
-            if magic != _TRR_MAGIC or not at < file.tell() <= size:
-                raise TrajectoryError(f"{path} is damaged or cut short in frame {len(found)}.")
-            has_cell |= not found and sizes[2] > 0
-            found.append(sizes[_TRR_PER_ATOM[0]] > 0)
-    return np.array(found, dtype=bool), has_cell
+        length = int.from_bytes(file.read(12)[8:], "big")
+        file.seek(-(-length // 4) * 4 + 8, 1)
+        return has, int.from_bytes(file.read(4), "big") > 0
 
 
 class MdanalysisReader(TrajectoryReader):
@@ -313,7 +307,7 @@ class MdanalysisReader(TrajectoryReader):
                 self.time_ps, self.times_known = self._times()
         except InputError:
             raise
-        except Exception as error:  # each of its readers raises its own kinds
+        except Exception as error:  # each of its readers raises errors of its own
             # Of a format that it does not know it lists all others in the lines that follow.
             why = first_line(error).partition(". The FORMATs")[0]
             raise TrajectoryError(
@@ -373,7 +367,7 @@ class _Frame(NamedTuple):
     cell_nm: Float64Array | None
 
 
-class AtomsReader(TrajectoryReader):
+class AtomsReader(_InMemory):
     """Reads an XYZ file, or one of ASE's `Trajectory`, whole into memory; names or elements are the file's, bonds found
     by distance.
 
@@ -399,12 +393,6 @@ class AtomsReader(TrajectoryReader):
             names = [f"{e}{k + 1}" for k, e in enumerate(first.names)] if is_ase else first.names
             stated = named_scene(path, names, _elements(first.names, path), first.positions_nm, first.cell_nm)
         self._take_scene(stated, top)
-
-    def _read(self, start: int, stop: int, stride: int) -> Float32Array:
-        return self._positions[start:stop:stride].copy()
-
-    def _read_cells(self, start: int, stop: int, stride: int) -> Float64Array | None:
-        return None if self._cells is None else self._cells[start:stop:stride].copy()
 
 
 def _ase_frames(path: Path) -> list[_Frame]:

@@ -29,12 +29,12 @@ _PS = {"picosecond": 1.0, "ps": 1.0, "femtosecond": 1e-3, "fs": 1e-3, "nanosecon
 
 
 def nm_per(unit: Any) -> float | None:
-    """Return the unit of length in nm, None of one that is not known."""
+    """Return the unit of length in nm, None for an unknown one."""
     return _NM.get(_name(unit))
 
 
 def ps_per(unit: Any) -> float | None:
-    """Return the unit of time in ps, None of one that is not known."""
+    """Return the unit of time in ps, None for an unknown one."""
     return _PS.get(_name(unit))
 
 
@@ -173,13 +173,13 @@ def scene_of_mdtraj_hdf5(path: Path, positions_nm: npt.ArrayLike) -> Scene:
         with warnings.catch_warnings(), HDF5TrajectoryFile(str(path)) as file:
             warnings.simplefilter("ignore")  # a topology may number no residues
             topology = file.topology
-    except Exception as error:  # PyTables and MDTraj raise their own kinds
+    except Exception as error:  # PyTables and MDTraj raise errors of their own
         raise TrajectoryError(f"{path} is damaged: its /topology cannot be understood ({error}).") from error
     return scene_from_mdtraj_topology(topology, positions_nm, name=path.stem, source=path.name)
 
 
 def scene_from_structure(top: Path, *, name: str) -> Scene:
-    """Return the Scene of a structure or topology file that stands beside a trajectory, by MDTraj or MDAnalysis.
+    """Return the Scene of a structure or topology file given with a trajectory, by MDTraj or MDAnalysis.
 
     Bonds are MDTraj's (its residue templates and CONECT records); atoms that it leaves without one are bonded by their
     distances. Elements of PDB and mmCIF files are read here: where the element column is empty MDTraj takes CA for
@@ -196,13 +196,13 @@ def scene_from_structure(top: Path, *, name: str) -> Scene:
         return scene_from_universe(top, name=name)
     try:
         structure = mdtraj.load(str(top))
-    except Exception as error:  # each MDTraj reader raises its own kinds
+    except Exception as error:  # each MDTraj reader raises errors of its own
         raise InputError(f"{top} cannot be read as a structure: {first_line(error)}.") from error
     topology = structure.topology
     elements = None
     with contextlib.suppress(InputError):
         records = read_structure(top).atoms
-        # MDTraj renames atoms, so that only positions tell whether both readers kept the same ones.
+        # MDTraj renames atoms, so only positions show whether both readers kept the same ones.
         read_nm = np.array([r.position_angstrom for r in records]) / 10.0
         if read_nm.shape == structure.xyz[0].shape and np.allclose(read_nm, structure.xyz[0], atol=1e-4):
             elements = [r.element for r in records]
@@ -223,7 +223,7 @@ def scene_from_universe(top: Path, *, name: str) -> Scene:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             universe = MDAnalysis.Universe(str(top), **({} if format_ is None else {"topology_format": format_}))
-    except Exception as error:  # each of its parsers raises its own kinds
+    except Exception as error:  # each of its parsers raises errors of its own
         raise InputError(f"{top} cannot be read as a topology: {first_line(error)}.") from error
     atoms = universe.atoms
     has_positions = hasattr(universe, "trajectory") and universe.trajectory.n_frames > 0
@@ -253,11 +253,7 @@ def scene_from_universe(top: Path, *, name: str) -> Scene:
 
 def is_mdtraj_format(path: Path) -> bool:
     """Whether MDTraj has a reader for files of this suffix."""
-    from mdtraj.formats.registry import FormatRegistry
-
-    if format_of(path) is not OTHER:
-        return format_of(path).reader in ("MDTraj", "surromd")
-    return any(path.name.lower().endswith(s) for s in FormatRegistry.loaders)
+    return format_of(path).reader in ("MDTraj", "surromd")
 
 
 def named_scene(
@@ -316,7 +312,7 @@ def bonds_completed(scene: Scene, cells_nm: npt.NDArray[np.float64] | None) -> S
 
 
 def with_orders(scene: Scene) -> Scene:
-    """Return the scene with bond orders and charges by valence, unchanged where they cannot be told."""
+    """Return the scene with bond orders and charges by valence, unchanged where they cannot be perceived."""
     try:
         orders, charges = perceive(list(scene.elements), scene.bonds)
     except ValenceError:

@@ -264,7 +264,7 @@ def _decompressed(data: bytes, n_frames: int, path: Path, first: int) -> tuple[F
         try:
             with XTCTrajectoryFile(str(copy)) as file:
                 positions, _, _, boxes = file.read()
-        except Exception as error:  # MDTraj raises several kinds
+        except Exception as error:  # MDTraj raises errors of many classes
             raise TrajectoryError(
                 f"{path} is damaged in frames {first} to {first + n_frames} ({first_line(error)}); restore it from a "
                 "whole copy."

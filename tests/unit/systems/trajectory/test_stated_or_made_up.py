@@ -126,7 +126,7 @@ def test_times_that_nobody_stated_are_said(folder: Path, tmp_path: Path, frames:
     made = mdtraj.load(str(folder / "mdtraj.pdb"))  # times 0, 1, 2, ... ps of MDTraj's own
     made.save(str(tmp_path / "a.xtc"))
     with open_trajectory(tmp_path / "a.xtc") as reader:
-        assert any("was told none" in note for note in reader.notes)
+        assert any("none were given" in note for note in reader.notes)
     with open_trajectory(folder / "mdtraj.xtc") as reader:
         assert not reader.notes
 
