@@ -29,6 +29,7 @@ from systems.trajectory.store import (
     CHECKSUMS,
     FRAMES,
     PER_ATOM,
+    WEIGHTS,
     Float32Array,
     Float64Array,
     FrameBlock,
@@ -214,7 +215,7 @@ class TrajectoryWriter(FrameStore, ABC):
 
 
 class TrajectoryReader(ABC):
-    """Reads one file. `flags` and `chunk_idx` are None, `record` is empty, where the file does not say.
+    """Reads one file. `flags`, `chunk_idx` and `weights` are None, `record` is empty, where the file does not say.
 
     `times_known` is False where the file holds no times: `time_ps` then only counts frames. `run_id`: of the run that
     wrote the file; `checksums`: of its frames `(n_frames,)`. `notes`: what was assumed or left out, for people.
@@ -230,6 +231,7 @@ class TrajectoryReader(ABC):
     flags: npt.NDArray[np.uint16] | None = None
     chunk_idx: npt.NDArray[np.int32] | None = None
     scalars: dict[str, Float64Array]
+    weights: Float64Array | None = None
     times_known: bool = True
     notes: tuple[str, ...] = ()
     run_id: str = ""
@@ -258,6 +260,7 @@ class TrajectoryReader(ABC):
         self.chunk_idx = own["chunk_idx"][: self.n_frames] if "chunk_idx" in own else None
         self.scalars = {name: own["scalars"][name][: self.n_frames] for name in own.get("scalars", ())}
         self.checksums = {name: column[: self.n_frames] for name, column in file.get(CHECKSUMS, {}).items()}
+        self.weights = None if WEIGHTS not in file else file[WEIGHTS][:].astype(np.float64)
         self.run_id, self.record = read_run_id(file), read_record(file)
         self.scene = Scene.from_dict(get_json(file, "surromd/scene"))
 

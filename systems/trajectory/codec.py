@@ -19,7 +19,7 @@ from systems.files.whole_file import OutputLock, journal_path
 from systems.scene import Scene
 from systems.trajectory.base import TrajectoryReader, TrajectoryWriter
 from systems.trajectory.companion_writer import POSITIONS_ALONE, is_our_topology, meta_path, topology_path
-from systems.trajectory.store import PER_ATOM, WEIGHTS, Float32Array, Float64Array, FrameStore, open_hdf5
+from systems.trajectory.store import PER_ATOM, Float32Array, Float64Array, FrameStore
 from systems.units import GAS_CONSTANT_KJ_MOL_K
 
 _HDF5 = (".h5", ".hdf5")
@@ -225,30 +225,21 @@ def frame_weights(path: str | Path) -> Float64Array:
     All replicas of one answer share a scale, mean 1 over all their frames: concatenate them as the frames. Raises
     TrajectoryError for a damaged file, or one that has grown since the weights were written.
     """
-    path = Path(path)
-    with closing(open_trajectory(path)) as reader:
-        n_frames = reader.n_frames
-    store = _store(path)
-    if store.suffix in (".h5", ".hdf5") and store.is_file():
-        with closing(open_hdf5(store)) as file:
-            if WEIGHTS in file:
-                weights = np.asarray(file[WEIGHTS][:], dtype=np.float64)
-                if len(weights) != n_frames:
-                    raise TrajectoryError(
-                        f"{path} holds {n_frames} frames and weights of {len(weights)}: it has grown since they were "
-                        "written; let the run that made it end."
-                    )
-                return weights
-    return np.ones(n_frames)
+    with open_trajectory(path) as reader:
+        weights, n_frames = reader.weights, reader.n_frames
+    if weights is None:
+        return np.ones(n_frames)
+    if len(weights) != n_frames:
+        raise TrajectoryError(
+            f"{path} holds {n_frames} frames and weights of {len(weights)}: it has grown since they were written; let "
+            "the run that made it end."
+        )
+    return weights
 
 
 def write_weights(path: Path, weights: Float64Array) -> None:
     """Write weights `(n_frames,)` into a trajectory of ours, or replace them. Raises InputError for another number of
     them, TrajectoryError for a file of others, StorageError."""
-    with closing(FrameStore(_store(path))) as store:
-        store.write_weights(np.asarray(weights, dtype=np.float64))
-
-
-def _store(path: Path) -> Path:
-    """Return the HDF5 file that holds a trajectory's columns: itself, or what lies beside a DCD."""
-    return meta_path(path) if path.suffix.lower() in POSITIONS_ALONE else path
+    store = meta_path(path) if path.suffix.lower() in POSITIONS_ALONE else path
+    with closing(FrameStore(store)) as file:
+        file.write_weights(np.asarray(weights, dtype=np.float64))

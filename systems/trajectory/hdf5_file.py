@@ -11,7 +11,9 @@ kJ/mol/nm.
 
 from __future__ import annotations
 
+import itertools
 import json
+import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -277,29 +279,22 @@ def is_plain_h5md(path: Path) -> bool:
 
 def _topology_json(scene: Scene) -> str:
     """Return MDTraj's topology JSON. Runs of atoms become residues, so that the atom order survives any scene."""
+    residue_of = scene.residue_of_atom.tolist()
     chains: list[dict[str, Any]] = []
-    n_residues = 0
-    last_residue = last_chain = None
-    for atom, residue in enumerate(scene.residue_of_atom.tolist()):
-        chain = scene.chain_of_residue[residue]
-        if chain != last_chain:
-            chains.append({"index": len(chains), "chain_id": chain or None, "residues": []})
-            last_chain, last_residue = chain, None
-        if residue != last_residue:
-            digits = "".join(c for c in scene.residue_ids[residue] if c.isdigit() or c == "-")
-            try:
-                number = int(digits)
-            except ValueError:
-                number = residue + 1
-            name = scene.residue_names[residue]
-            chains[-1]["residues"].append(
-                {"index": n_residues, "name": name, "resSeq": number, "segmentID": "", "atoms": []}
-            )
-            n_residues, last_residue = n_residues + 1, residue
-        chains[-1]["residues"][-1]["atoms"].append(
-            {"index": atom, "name": scene.atom_names[atom], "element": scene.elements[atom],
-             "formal_charge": int(scene.formal_charges[atom])}
-        )  # fmt: skip
+    index = itertools.count()
+    for chain, atoms in itertools.groupby(range(scene.n_atoms), lambda atom: scene.chain_of_residue[residue_of[atom]]):
+        residues = []
+        for residue, members in itertools.groupby(atoms, residue_of.__getitem__):
+            digits = re.sub(r"[^0-9-]", "", scene.residue_ids[residue])
+            number = int(digits) if re.fullmatch(r"-?\d+", digits) else residue + 1
+            held = [
+                {"index": atom, "name": scene.atom_names[atom], "element": scene.elements[atom],
+                 "formal_charge": int(scene.formal_charges[atom])}
+                for atom in members
+            ]  # fmt: skip
+            residues.append({"index": next(index), "name": scene.residue_names[residue], "resSeq": number,
+                             "segmentID": "", "atoms": held})  # fmt: skip
+        chains.append({"index": len(chains), "chain_id": chain or None, "residues": residues})
     orders = scene.bond_orders.tolist()
     metadata = [{"order": order or None, "type": _BOND_TYPES.get(order)} for order in orders]
     return json.dumps({"chains": chains, "bonds": scene.bonds.tolist(), "bond_metadata": metadata})
