@@ -14,7 +14,7 @@ from __future__ import annotations
 import itertools
 import json
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -214,58 +214,50 @@ class Hdf5Reader(TrajectoryReader):
 
 
 class H5mdReader(Hdf5Reader):
-    """Reads the positions of another program's H5MD file. Times that are fixed steps or without a unit are not known.
+    """Reads the positions of another program's H5MD file. Times that are fixed steps are not used.
 
-    Raises TrajectoryError for a file that is damaged or states no unit of length, InputError for several groups of
-    particles or a `top` that does not fit.
+    Raises TrajectoryError for a file that is damaged or lacks units, InputError for several groups of particles or a
+    `top` that does not fit.
     """
 
     def _read_headers(self, top: Path | None) -> None:
         groups = [g for g in self._file.get("particles", {}).values() if "position/value" in g]
         if len(groups) != 1:
-            names = ", ".join(g.name.rpartition("/")[2] for g in groups)
-            which = f"several groups of particles ({names}); write one of them alone" if groups else "no positions"
-            raise InputError(f"{self.path} holds {which}.")
-        self._box, position = groups[0].get("box"), groups[0]["position"]
+            raise InputError(f"{self.path} holds positions of {len(groups)} groups of particles; write one alone.")
+        self._edges, position = groups[0].get("box/edges"), groups[0]["position"]
         self._take_coordinates(position["value"])
-        self.n_frames = len(self._coordinates)
-        nm = nm_per(self._coordinates.attrs.get("unit", ""))
-        if nm is None:
-            raise TrajectoryError(
-                f"{self.path}: its positions state no unit of length that is known; set the attribute `unit` of "
-                f"{self._coordinates.name} to 'nm' or 'Angstrom'."
-            )
-        self._nm = nm
-        self.time_ps, self.times_known = np.arange(self.n_frames, dtype=np.float64), False
+        self.n_frames, self._nm = len(self._coordinates), self._per_unit(self._coordinates, nm_per)
         time = position.get("time")
-        ps = None if time is None or not time.ndim else ps_per(time.attrs.get("unit", ""))
-        if ps is not None:
-            self.time_ps, self.times_known = ps * np.asarray(time[:], dtype=np.float64), True
-            if len(self.time_ps) != self.n_frames:
-                raise TrajectoryError(f"{self.path} is damaged: {self.n_frames} frames, {len(self.time_ps)} times.")
-        elif time is not None:
-            self.notes = ("its times are fixed steps, or state no unit that is known, and are not used.",)
+        self.times_known = time is not None and time.ndim == 1
+        self.time_ps = np.arange(self.n_frames, dtype=np.float64)
+        if self.times_known:
+            self.time_ps = self._per_unit(time, ps_per) * np.asarray(time[:], dtype=np.float64)
+        if len(self.time_ps) != self.n_frames:
+            raise TrajectoryError(f"{self.path} is damaged: {self.n_frames} frames, {len(self.time_ps)} times.")
         self._take_scene(self._scene_of(top), top)
 
+    def _per_unit(self, column: h5py.Dataset, per: Callable[[Any], float | None]) -> float:
+        """Return what one of a dataset's unit is in nm or ps."""
+        factor = per(column.attrs.get("unit", ""))
+        if factor is None:
+            raise TrajectoryError(
+                f"{self.path}: {column.name} states no known unit; set its `unit` to 'nm' or 'ps', say."
+            )
+        return factor
+
     def _read_cells(self, start: int, stop: int, stride: int) -> Float64Array | None:
+        if self._edges is None:
+            return None
         with damage_reported(self.path):
-            edges = None if self._box is None else self._box.get("edges", self._box.attrs.get("edges"))
-            if edges is None:
-                return None
-            column = edges.get("value") if isinstance(edges, h5py.Group) else None
-            if column is not None:
-                values, unit = np.asarray(column[start:stop:stride]), column.attrs.get("unit")
-            else:
-                one = np.asarray(edges[()])
-                values = np.broadcast_to(one, (len(range(start, stop, stride)), *one.shape))
-                unit = edges.attrs.get("unit") if isinstance(edges, h5py.Dataset) else None
-            nm = self._nm if unit is None else nm_per(unit)
-            if nm is None:
-                raise TrajectoryError(
-                    f"{self.path}: its cell is in {unit!r}, a unit that is not known; write it in nm."
-                )
-            cells = values[..., None] * np.eye(3) if values.ndim == 2 else values
-            return None if not np.any(cells) else np.asarray(cells, dtype=np.float64) * nm
+            is_fixed = isinstance(self._edges, h5py.Dataset)
+            column = self._edges if is_fixed else self._edges["value"]
+            values = np.asarray(column[()] if is_fixed else column[start:stop:stride], dtype=np.float64)
+            if is_fixed:
+                values = np.broadcast_to(values, (len(range(start, stop, stride)), *values.shape))
+            if values.ndim == 2:  # the edges of a cuboid
+                values = values[..., None] * np.eye(3)
+            nm = self._per_unit(column, nm_per) if "unit" in column.attrs else self._nm
+            return nm * values if values.any() else None
 
 
 def is_plain_h5md(path: Path) -> bool:
