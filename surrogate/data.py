@@ -22,7 +22,7 @@ from systems.errors import InputError, TrajectoryError, first_line
 from systems.files.schema import built, parsed
 from systems.files.whole_file import create_whole
 from systems.scene import Scene
-from systems.trajectory.base import open_hdf5
+from systems.trajectory.store import open_hdf5
 
 if TYPE_CHECKING:
     import h5py
@@ -368,7 +368,7 @@ class _Survey:
 
 def _survey(paths: list[Path], held: list[Path], *, canonical: bool, velocities: bool) -> _Survey:
     """Return what the files say of themselves. Raises InputError when they do not go together."""
-    from systems.trajectory.codec import open_trajectory, refuse_joined
+    from systems.trajectory.codec import open_trajectory
 
     if not paths:
         raise InputError("no trajectory given to train on.")
@@ -380,7 +380,6 @@ def _survey(paths: list[Path], held: list[Path], *, canonical: bool, velocities:
         with open_trajectory(path) as reader:
             if reader.scene is None:
                 raise InputError(f"{path} carries no topology; give an HDF5 file written by surromd or MDTraj.")
-            refuse_joined(reader)
             steps = np.diff(reader.time_ps)
             if len(steps) == 0 or not np.allclose(steps, steps[0], rtol=1e-4):
                 raise InputError(f"{path}: frames are not evenly spaced in time; training needs one save interval.")

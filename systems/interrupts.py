@@ -20,7 +20,7 @@ from typing import Any
 _PATIENCE_S = 1.0
 # So often it is looked whether an interruption is still on its way out.
 _LOOK_S = 0.5
-# So long what ends is not disturbed by being told to end again.
+# For so long a second signal does not disturb what is ending.
 _CLEAN_UP_S = 30.0
 
 _thread = threading.local()
@@ -98,7 +98,7 @@ def _numbers() -> list[signal.Signals]:
 
 @contextmanager
 def stop_when(asked: Callable[[], bool]) -> Iterator[None]:
-    """Have `deferred_interrupt` ask `asked` in this thread: how a run outside the main thread is told to stop."""
+    """Have `deferred_interrupt` ask `asked` in this thread: how to stop a run outside the main thread."""
     previous = getattr(_thread, "asked", None)
     _thread.asked = asked
     try:

@@ -41,11 +41,6 @@ class Replicated:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Joining(Replicated):
-    join: bool = option("Also write all replicas into one file, NAME.h5.", False)
-
-
-@dataclass(frozen=True, kw_only=True)
 class Quiet:
     quiet: bool = option("No progress bar and no summary.", False, words=("quiet", "q"))
 
@@ -100,7 +95,7 @@ class PlanOptions(MDSettings, Replicated, Preparation):
 
 
 @dataclass(frozen=True, kw_only=True)
-class ReferenceOptions(MDSettings, Joining, Preparation, Seeded, Resuming, Overwriting, Quiet):
+class ReferenceOptions(MDSettings, Replicated, Preparation, Seeded, Resuming, Overwriting, Quiet):
     """Options of `reference`."""
 
     time_ps: float = from_field(MDConfig, "time_ps")
@@ -111,7 +106,7 @@ class ReferenceOptions(MDSettings, Joining, Preparation, Seeded, Resuming, Overw
 
 
 @dataclass(frozen=True, kw_only=True)
-class RolloutOptions(RolloutConfig, Joining, Preparation, Resuming, Overwriting, Quiet):
+class RolloutOptions(RolloutConfig, Replicated, Preparation, Resuming, Overwriting, Quiet):
     """Options of `rollout`."""
 
 

@@ -13,7 +13,7 @@ from surrogate.verbs.options import Trajectories
 from systems.errors import InputError
 from systems.trajectory.checkpoint import checkpoint_path, frames_in
 from systems.trajectory.codec import WRITTEN
-from systems.trajectory.companion_writer import refuse_foreign_topology
+from systems.trajectory.companion_writer import refuse_other_companions
 
 
 def check_outputs(
@@ -38,14 +38,7 @@ def check_outputs(
         if path.exists() and not (resume or overwrite):
             raise InputError(f"{path} exists; add `overwrite=True` to replace it, or choose another name.")
         if path.suffix.lower() in WRITTEN and suffixes == WRITTEN and not resume:
-            refuse_foreign_topology(path)
-
-
-def join_replicas(written: Sequence[Path], joined: Sequence[Path], *, overwrite: bool) -> list[Path]:
-    """Return what a verb wrote, with the file `joined` of all replicas at the end, where there is to be one."""
-    from systems.trajectory.codec import join
-
-    return [*written, *(join(written, out, overwrite=overwrite) for out in joined)]
+            refuse_other_companions(path)
 
 
 @contextmanager
@@ -85,7 +78,7 @@ def find_trajectories(spec: Trajectories, *, verify: bool = False) -> list[Path]
     if path.is_dir():
         files = [p for p in sorted(path.iterdir()) if not p.name.endswith(".meta.h5")]
         for suffixes in ((".h5", ".hdf5"), (".dcd",), (".xtc",)):
-            found = _counted_once([p for p in files if p.suffix.lower() in suffixes])
+            found = [p for p in files if p.suffix.lower() in suffixes]
             if found:
                 return found
         raise InputError(f"{path}: no trajectory (.h5, .dcd, .xtc) in this folder.")
@@ -96,23 +89,8 @@ def find_trajectories(spec: Trajectories, *, verify: bool = False) -> list[Path]
         parts = [part.strip() for part in text.split(",") if part.strip()]
         return [p for part in parts for p in find_trajectories(part, verify=verify)]
     if any(c in text for c in "*?["):
-        found = _counted_once([Path(p) for p in sorted(glob(text)) if not p.endswith(".meta.h5")])
+        found = [Path(p) for p in sorted(glob(text)) if not p.endswith(".meta.h5")]
         if found:
             return found
         raise InputError(f"{text}: no file matches.")
     raise InputError(f"{text}: no such file.")
-
-
-def _counted_once(found: list[Path]) -> list[Path]:
-    """Return files without those that join others of them, which would be counted twice."""
-    from systems.trajectory.codec import KEY, open_trajectory
-
-    kept = []
-    for path in found:
-        if path.with_name(f"{path.stem}_r0{path.suffix}") in found:
-            with open_trajectory(path) as reader:
-                if KEY in reader.record:
-                    sys.stderr.write(f"{path} joins replicas that are taken one by one, and is left out\n")
-                    continue
-        kept.append(path)
-    return kept

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from surrogate.progress import progress_bar
 from surrogate.verbs.options import PlanOptions, ReferenceOptions, tell
-from surrogate.verbs.outputs import check_outputs, join_replicas, summarised_outputs
+from surrogate.verbs.outputs import check_outputs, summarised_outputs
 from surrogate.verbs.scenes import prepare_scene
 from systems.options import options_as_keywords
 from systems.trajectory.codec import WRITTEN
@@ -45,20 +45,18 @@ def reference(scene: str | Path | Scene, out: str | Path, options: ReferenceOpti
     nm) on each side, counter-ions, and NaCl at `ionic_strength_molar` (0), drawn with `seed`.
 
     `out` ends in .h5, .dcd or .xtc; with several replicas NAME.h5 becomes NAME_r0.h5, NAME_r1.h5, ..., with seeds
-    `seed`, `seed + 1`, ..., and `join` writes them into NAME.h5, too, one after another, whose record says where each
-    begins. Settings that are not given are those of `protocol` (a paper's, by
-    name), else ff14SB in OBC2 for peptides and GAFF2 in vacuum for other molecules, 300 K, 1/ps,
-    4 fs, 3 Da, 100 ps of equilibration that is not written, nvt, frames every ps, whatever name the molecule is asked
-    for by; model systems bring their own. `hydrogen_mass_da=None` keeps natural masses. `ph` to `cap_breaks`: see
-    `systems.library.named_scenes.prepare`. `resume` goes on from the checkpoint beside `out`.
+    `seed`, `seed + 1`, .... Settings that are not given are those of `protocol` (a paper's, by name), else ff14SB in
+    OBC2 for peptides and GAFF2 in vacuum for other molecules, 300 K, 1/ps, 4 fs, 3 Da, 100 ps of equilibration that is
+    not written, nvt, frames every ps, whatever name the molecule is asked for by; model systems bring their own.
+    `hydrogen_mass_da=None` keeps natural masses. `ph` to `cap_breaks`: see `systems.library.named_scenes.prepare`.
+    `resume` goes on from the checkpoint beside `out`.
     Raises InputError, PreparationError (no parameters), SimulationError (the good frames stay) and StorageError.
     """
     from md_reference.run.replicas import simulate_replicas
     from systems.files.whole_file import replica_paths
 
     outs = replica_paths(Path(out), options.replicas)
-    joined = [Path(out)] if options.join and len(outs) > 1 else []
-    check_outputs([*outs, *joined], WRITTEN, resume=options.resume, overwrite=options.overwrite)
+    check_outputs(outs, WRITTEN, resume=options.resume, overwrite=options.overwrite)
     molecule = prepare_scene(scene, options, quiet=options.quiet)
     molecule, config, protocol = resolve_run(molecule, options, {"time_ps": options.time_ps}, quiet=options.quiet)
     _ = config.n_frames, config.steps_per_frame  # uneven intervals are refused before anything runs
@@ -69,7 +67,7 @@ def reference(scene: str | Path | Scene, out: str | Path, options: ReferenceOpti
         summarised_outputs(outs, resumable="the same again with `resume=True` goes on"),
         progress_bar(label, quiet=options.quiet, ps_per_frame=config.save_every_ps) as progress,
     ):
-        written = simulate_replicas(
+        return simulate_replicas(
             molecule,
             config,
             outs,
@@ -78,7 +76,6 @@ def reference(scene: str | Path | Scene, out: str | Path, options: ReferenceOpti
             progress=progress,
             announce=None if options.quiet else lambda said: tell(molecule.name, str(said)),
         )
-    return join_replicas(written, joined, overwrite=options.resume or options.overwrite)
 
 
 def resolve_run(

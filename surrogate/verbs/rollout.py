@@ -9,7 +9,7 @@ from surrogate.models.architecture import weights_path
 from surrogate.progress import progress_bar
 from surrogate.sampling.config import RolloutConfig
 from surrogate.verbs.options import RolloutOptions, tell
-from surrogate.verbs.outputs import check_outputs, join_replicas, summarised_outputs
+from surrogate.verbs.outputs import check_outputs, summarised_outputs
 from surrogate.verbs.scenes import prepare_scene
 from systems.options import options_as_keywords, part_of
 from systems.trajectory.codec import WRITTEN
@@ -28,7 +28,7 @@ def rollout(
     says which and why. Atoms are written in the scene's own order, frames at the interval of the weights or a multiple
     of it (`save_every_ps`), each marked with its chunk and validity. Weights that were trained for several lags step at
     `lag_ps`, by default at the longest that `save_every_ps` is a multiple of; weights of several peptides take others
-    of the same residues. Replicas run in one batch, are named as by `reference` and joined as there. `solver`:
+    of the same residues. Replicas run in one batch, are named as by `reference`. `solver`:
     'multistep', 'fitted' (for few `solver_steps`, 2 to 10), 'euler' or the adaptive 'dopri5', None for the one that
     suits the weights. `precision`: 'fp32', 'bf16' or 'auto'. `compile`: the networks, by torch; it takes a C++ compiler
     and about a minute, and pays in long rollouts.
@@ -47,8 +47,7 @@ def rollout(
     from systems.files.whole_file import replica_paths
 
     outs = replica_paths(Path(out), options.replicas)
-    joined = [Path(out)] if options.join and len(outs) > 1 else []
-    check_outputs([*outs, *joined], WRITTEN, resume=options.resume, overwrite=options.overwrite)
+    check_outputs(outs, WRITTEN, resume=options.resume, overwrite=options.overwrite)
     file = None if weights is None else weights_path(weights)
     molecule = prepare_scene(scene, options, quiet=options.quiet)
 
@@ -74,7 +73,7 @@ def rollout(
         # The verb counts the frames of one replica; all advance together.
         progress_bar(label, quiet=options.quiet, ps_per_frame=saved_ps * len(outs)) as progress,
     ):
-        written = roll(
+        return roll(
             molecule,
             loaded,
             outs,
@@ -84,4 +83,3 @@ def rollout(
             progress=progress,
             announce=None if options.quiet else lambda line: tell(molecule.name, line),
         )
-    return join_replicas(written, joined, overwrite=options.resume or options.overwrite)

@@ -13,7 +13,7 @@ from pathlib import Path
 
 from systems.errors import SurromdError
 
-# Linked apart: told of fast mathematics, GCC before 13 links what has the whole process round small numbers to zero.
+# Linked apart: with -ffast-math GCC before 13 links what has the whole process round small numbers to zero.
 _FLAGS = ("-O3", "-march=native", "-ffast-math", "-fopenmp-simd", "-fPIC", "-std=c++17", "-w", "-c")
 
 

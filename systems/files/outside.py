@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gzip
 import math
 import os
 import shutil
@@ -37,20 +38,14 @@ def content(path: Path) -> bytes:
     data = path.read_bytes()
     if data[:2] != b"\x1f\x8b":
         return data
-    parts, size = [], 0
-    while data:
-        engine = zlib.decompressobj(wbits=31)
-        try:
-            parts.append(engine.decompress(data, _TEXT_BYTES - size + 1))
-        except zlib.error as error:
-            raise ValueError(f"a damaged gzip file, {error}") from error
-        size += len(parts[-1])
-        if size > _TEXT_BYTES:
-            raise ValueError(f"it unpacks to more than {_TEXT_BYTES // 1_000_000} MB")
-        if not engine.eof:
-            raise ValueError("it is cut short")
-        data = engine.unused_data.lstrip(b"\0")
-    return b"".join(parts)
+    try:
+        with gzip.GzipFile(path) as file:
+            data = file.read(_TEXT_BYTES + 1)
+    except (EOFError, zlib.error, gzip.BadGzipFile) as error:
+        raise ValueError(f"a damaged gzip file, {error}") from error
+    if len(data) > _TEXT_BYTES:
+        raise ValueError(f"it unpacks to more than {_TEXT_BYTES // 1_000_000} MB")
+    return data
 
 
 def open_checked(path: Path, mode: str = "r", source: Any = None) -> h5py.File:

@@ -200,25 +200,11 @@ def frame_checksums(columns: Mapping[str, npt.NDArray[Any]]) -> Checksums:
     return upper
 
 
-def frames_digest(checksums: Mapping[str, Checksums]) -> Any:
-    """Return the SHA-256 object of frames' checksums `(n,)` by name; frames that come later are added to it."""
-    return hashlib.sha256(checksum_rows(checksums))
-
-
 def checksum_rows(checksums: Mapping[str, Checksums]) -> bytes:
-    """Return the checksums of frames as bytes, frame by frame; none of a file of an early version, which has none."""
+    """Return the checksums `(n,)` of frames by name as bytes, frame by frame; none of a file of an early version."""
     if not checksums:
         return b""
     return np.stack([checksums[name] for name in sorted(checksums)], axis=1).astype("<u4").tobytes()
-
-
-def check_frames_read(path: Any, stored: Checksums, found: Checksums, start: int, stride: int) -> None:
-    """Raise TrajectoryError when frames `start`, `start + stride`, ... are not those that were written."""
-    if not np.array_equal(stored, found):
-        bad = start + stride * int(np.argmax(stored != found))
-        raise TrajectoryError(
-            f"{path} is damaged at frame {bad}: it is not what was written (checksum); restore it from a whole copy."
-        )
 
 
 def sealed(text: str) -> str:
@@ -243,8 +229,8 @@ def packed(header: dict[str, Any], blob: bytes) -> bytes:
     return f"{digest} {len(blob)} {text}\n".encode() + blob
 
 
-def unpacked(data: bytes) -> tuple[dict[str, Any], bytes, bytes]:
-    """Return header and bytes of what `packed` made, and what follows them. Raises ValueError when it is damaged."""
+def unpacked(data: bytes) -> tuple[dict[str, Any], bytes]:
+    """Return header and bytes of what `packed` made, whatever follows them. Raises ValueError when it is damaged."""
     line, _, rest = data.partition(b"\n")
     digest, size, text = [*line.split(b" ", 2), b"", b"", b""][:3]
     blob = rest[: int(size)] if size.isdigit() else b""
@@ -253,7 +239,7 @@ def unpacked(data: bytes) -> tuple[dict[str, Any], bytes, bytes]:
     header = parsed(text)
     if not isinstance(header, dict):
         raise ValueError("its header is no table")
-    return header, blob, rest[len(blob) :]
+    return header, blob
 
 
 def _digest(text: str) -> str:
@@ -291,7 +277,6 @@ def _factors(name: str, n: int) -> _Words:
 
 _MAGIC = b"surromd journal 1\n"
 _Writes = list[tuple[int, bytes]]
-_BTREE, _SYMBOLS = b"TREE", b"SNOD"
 
 
 def journal_path(path: Path) -> Path:
@@ -307,8 +292,7 @@ class AtomicFile(io.RawIOBase):
     collects the writes of one append. What they overwrite goes to a journal beside the file first, on the medium, then
     the writes to the file; when these are on the medium, too, the journal is void. One that is not void is from a
     transaction that did not end: who opens the file to write puts the old bytes back, who opens it to read sees them in
-    their place. Other programs read such a file as well: in-place writes are made in an order in which every prefix is
-    readable (superblock, index nodes from the root down, data and object headers, names last).
+    their place.
 
     `key`: where in the file bytes lie that no other file has, and that no transaction changes; by them a journal knows
     its file. One writer at a time is for the caller to see to. `failure`: why the file could not be read. Raises
@@ -354,7 +338,7 @@ class AtomicFile(io.RawIOBase):
             data = self._journal.read_bytes()
             if data[: len(_MAGIC)].strip(b"\0") not in (b"", _MAGIC):
                 raise InputError(f"{self._journal} lies where a journal goes and is none; move it away.")
-            header, old, _ = unpacked(data[len(_MAGIC) :])
+            header, old = unpacked(data[len(_MAGIC) :])
             if os.pread(self._fd, header["key"][1], header["key"][0]).hex() != header["bytes"]:
                 return None
             writes, at = [], 0
@@ -419,16 +403,12 @@ class AtomicFile(io.RawIOBase):
         if self._dead:
             raise self.failure or OSError(errno.EIO, "an earlier write failed")
         end = self._committed_size
-        writes = _latest(self._pending)
-        beyond = [(max(offset, end), block[max(end - offset, 0) :]) for offset, block in writes]
-        inside = sorted(
-            [(offset, block[: max(end - offset, 0)]) for offset, block in writes if offset < end], key=_rank
-        )
         old: _Writes = []
         try:
-            old = [(offset, os.pread(self._fd, len(block), offset)) for offset, block in inside]
+            inside = [(offset, min(len(block), end - offset)) for offset, block in self._pending if offset < end]
+            old = [(offset, os.pread(self._fd, length, offset)) for offset, length in inside]
             self._keep(end, old)
-            for offset, block in beyond + inside:
+            for offset, block in self._pending:
                 write_whole(self._fd, block, offset)
             if self._size > end:
                 os.ftruncate(self._fd, self._size)
@@ -470,36 +450,3 @@ class AtomicFile(io.RawIOBase):
             os.close(self._fd)
         self._fd = self._journal_fd = -1
         super().close()
-
-
-def _latest(writes: _Writes) -> _Writes:
-    """Return disjoint writes with the same effect: where two overlap, the later one stands."""
-    kept: _Writes = []
-    for offset, block in reversed(writes):
-        pieces = [(offset, block)]
-        for other, cover in kept:
-            end = other + len(cover)
-            trimmed = []
-            for start, data in pieces:
-                if start + len(data) <= other or start >= end:
-                    trimmed.append((start, data))
-                    continue
-                if start < other:
-                    trimmed.append((start, data[: other - start]))
-                if start + len(data) > end:
-                    trimmed.append((end, data[end - start :]))
-            pieces = trimmed
-            if not pieces:
-                break
-        kept.extend(pieces)
-    return kept
-
-
-def _rank(item: tuple[int, bytes]) -> tuple[int, int]:
-    """Order of in-place writes: superblock, index nodes from the root down, from the end of the file back, names."""
-    offset, block = item
-    if offset == 0:
-        return (0, 0)
-    if block[:4] == _BTREE and len(block) > 5:
-        return (1, -block[5])
-    return (3 if block[:4] == _SYMBOLS else 2, -offset)

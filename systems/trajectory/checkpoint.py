@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import uuid
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import Annotated, Any, NotRequired, TypedDict
@@ -74,7 +74,7 @@ def read_checkpoint(path: Path) -> Checkpoint:
         content = path.read_bytes()
         if not content.startswith(_MAGIC):
             raise ValueError("it is of another version of surromd, or no checkpoint")
-        header, blob, _ = unpacked(content[len(_MAGIC) :])  # earlier versions wrote the state before behind the last
+        header, blob = unpacked(content[len(_MAGIC) :])
         fitted(header, _Header, "header")
     except (OSError, ValueError) as error:
         raise InputError(f"checkpoint {path} cannot be read ({error}); start again with `overwrite=True`.") from error
@@ -137,13 +137,7 @@ def _unsupported(out: Path, header: dict[str, Any], k: int, *, begun: bool) -> s
 
 
 @contextmanager
-def locked_outputs(
-    outs: Sequence[Path],
-    *,
-    may_exist: bool,
-    patience_s: float = 0.0,
-    stopped: Callable[[], bool] = lambda: False,
-) -> Iterator[None]:
+def locked_outputs(outs: Sequence[Path], *, may_exist: bool) -> Iterator[None]:
     """Lock a run's trajectories; when it fails, remove those it made that have no frames.
 
     What there is to go on from is kept when the run was stopped, or the disk is full: files of a run with a checkpoint.
@@ -152,7 +146,7 @@ def locked_outputs(
     """
     with ExitStack() as stack:
         for out in outs:
-            stack.enter_context(OutputLock(out, patience_s=patience_s, stopped=stopped))
+            stack.enter_context(OutputLock(out))
         refuse_foreign(checkpoint_path(outs[0]))
         for out in outs:
             refuse_existing(out, may_exist)

@@ -1,14 +1,13 @@
 """The one trajectory codec: HDF5 (the full record), DCD and XTC (what others read), streaming, append, resume.
 
-And what is made of whole trajectories: one file of several replicas, MDTraj's and MDAnalysis' objects, weights of
-frames.
+And what is made of whole trajectories: MDTraj's and MDAnalysis' objects, weights of frames.
 """
 
 from __future__ import annotations
 
 import weakref
-from collections.abc import Mapping, Sequence
-from contextlib import ExitStack, closing
+from collections.abc import Sequence
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -17,27 +16,15 @@ import numpy.typing as npt
 
 from systems.errors import InputError, TrajectoryError
 from systems.files.whole_file import OutputLock, journal_path
-from systems.scene import PARTICLE, Scene
-from systems.trajectory.base import (
-    WEIGHTS,
-    Float32Array,
-    Float64Array,
-    FrameBlock,
-    FrameStore,
-    TrajectoryReader,
-    TrajectoryWriter,
-    check_same_topology,
-    open_hdf5,
-)
+from systems.scene import Scene
+from systems.trajectory.base import TrajectoryReader, TrajectoryWriter
+from systems.trajectory.companion_writer import POSITIONS_ALONE, is_our_topology, meta_path, topology_path
+from systems.trajectory.store import PER_ATOM, Float32Array, Float64Array, FrameStore
 from systems.units import GAS_CONSTANT_KJ_MOL_K
 
-__all__ = ["FrameBlock", "TrajectoryReader", "TrajectoryWriter", "companions", "open_trajectory", "open_writer"]
-
 _HDF5 = (".h5", ".hdf5")
-_WITH_COMPANIONS = (".dcd", ".xtc")
-_COLUMNS = ("velocities", "forces")
 # What trajectories are written as.
-WRITTEN = (*_HDF5, *_WITH_COMPANIONS)
+WRITTEN = (*_HDF5, *POSITIONS_ALONE)
 
 
 def open_writer(
@@ -76,18 +63,16 @@ def open_writer(
         raise InputError(
             f"{path}: trajectories are written as .h5, .dcd or .xtc, not {path.suffix or 'without a suffix'!r}."
         )
-    from systems.trajectory.companion_writer import XtcWriter
     from systems.trajectory.dcd_file import DcdWriter
     from systems.trajectory.hdf5_file import Hdf5Writer
+    from systems.trajectory.xtc_file import XtcWriter
 
     lock = None if locked else OutputLock(path)
-    how: dict[str, Any] = {"append": append, "overwrite": overwrite, "run_id": run_id}
+    writers: dict[str, type[TrajectoryWriter]] = {".dcd": DcdWriter, ".xtc": XtcWriter}
     try:
-        writer: TrajectoryWriter
-        if suffix in _WITH_COMPANIONS:
-            writer = (DcdWriter if suffix == ".dcd" else XtcWriter)(path, scene, record, **how)
-        else:
-            writer = Hdf5Writer(path, scene, record, columns=columns, **how)
+        writer = writers.get(suffix, Hdf5Writer)(
+            path, scene, record, append=append, overwrite=overwrite, columns=columns, run_id=run_id
+        )
     except BaseException:
         if lock is not None:
             lock.close()
@@ -100,22 +85,19 @@ def open_writer(
 
 def refuse_columns(path: Path, columns: Sequence[str]) -> None:
     """Raise InputError where a trajectory of this name cannot hold these columns beside positions."""
-    if columns and path.suffix.lower() in _WITH_COMPANIONS:
+    if columns and path.suffix.lower() in POSITIONS_ALONE:
         kind = path.suffix[1:].upper()
         raise InputError(f"{path}: {kind} files hold positions only; write an .h5 to keep {' and '.join(columns)}.")
     for name in columns:
-        if name not in _COLUMNS:
-            raise InputError(f"{path}: no column {name!r} can be stored; known: {', '.join(_COLUMNS)}.")
+        if name not in PER_ATOM:
+            raise InputError(f"{path}: no column {name!r} can be stored; known: {', '.join(PER_ATOM)}.")
 
 
 def companions(path: Path) -> tuple[Path, ...]:
     """Return the paths of what is written beside a trajectory."""
-    from systems.trajectory import companion_writer
-
-    pdb, meta = companion_writer.companions(path)
-    if path.suffix.lower() not in _WITH_COMPANIONS:
-        return pdb, journal_path(path)
-    return pdb, meta, journal_path(meta)
+    if path.suffix.lower() not in POSITIONS_ALONE:
+        return topology_path(path), journal_path(path)
+    return topology_path(path), meta_path(path), journal_path(meta_path(path))
 
 
 def open_trajectory(path: str | Path, *, top: str | Path | None = None) -> TrajectoryReader:
@@ -127,120 +109,29 @@ def open_trajectory(path: str | Path, *, top: str | Path | None = None) -> Traje
     TrajectoryError when the file is missing, damaged or incomplete (it is never read as far as it goes); InputError
     when a topology is needed, or does not fit.
     """
-    from systems.trajectory import companion_writer, dcd_file, foreign_readers, hdf5_file
-    from systems.trajectory.foreign_scenes import XYZ_SUFFIXES, is_mdtraj_format
+    from systems.trajectory import dcd_file, foreign_readers, hdf5_file, xtc_file
+    from systems.trajectory.foreign_scenes import XYZ_SUFFIXES, format_of
 
     path, top = Path(path), None if top is None else Path(top)
     suffix = path.suffix.lower()
     if suffix in _HDF5 and not hdf5_file.is_plain_h5md(path):
         return hdf5_file.Hdf5Reader(path, top)
     if suffix in (*_HDF5, ".h5md"):
-        return foreign_readers.H5mdReader(path, top)
+        return hdf5_file.H5mdReader(path, top)
     if suffix == ".dcd":
         return dcd_file.DcdReader(path, top)
     if suffix == ".xtc":
-        if companion_writer.is_ours(path):
-            return companion_writer.XtcReader(path, top)
-        pdb = companion_writer.topology_path(path)
-        top = pdb if top is None and companion_writer.is_our_topology(pdb) else top
-    if suffix == ".traj":
-        return foreign_readers.AseReader(path, top)
-    if path.name.lower().endswith(XYZ_SUFFIXES):
-        return foreign_readers.XyzReader(path, top)
-    if is_mdtraj_format(path):
+        if xtc_file.is_of_xtc(path):
+            return xtc_file.XtcReader(path, top)
+        if top is None and is_our_topology(topology_path(path)):
+            top = topology_path(path)
+    if suffix in (".xtc", ".trr", ".nc", ".ncdf", ".netcdf"):
+        return foreign_readers.StreamReader(path, top)
+    if path.name.lower().endswith((*XYZ_SUFFIXES, ".traj")):
+        return foreign_readers.AtomsReader(path, top)
+    if format_of(path).reader == "MDTraj":
         return foreign_readers.MdtrajReader(path, top)
     return foreign_readers.MdanalysisReader(path, top)
-
-
-# ---- several replicas in one file -----------------------------------------------------------------------------------
-
-
-KEY = "joined"
-_AT_ONCE = 2048
-
-
-def join(paths: Sequence[Path], out: Path, *, overwrite: bool = False) -> Path:
-    """Write the frames of replicas into one file, in the order of `paths`, and return its path.
-
-    Kept are positions, cells, flags, chunks and scalars, and velocities and forces where all replicas and the format
-    hold them. Times are each replica's own, moved behind those before it. Raises InputError where the replicas differ
-    in atoms or save interval, TrajectoryError, StorageError.
-    """
-    with ExitStack() as stack:
-        readers = [stack.enter_context(open_trajectory(path)) for path in paths]
-        first, scene = readers[0], readers[0].scene
-        for reader in readers:
-            if reader.scene is None or scene is None:
-                raise InputError(f"{reader.path} holds no topology; it cannot be joined.")
-            check_same_topology(reader.path, reader.scene, scene)
-        assert scene is not None
-        intervals = [float(np.median(np.diff(r.time_ps))) for r in readers if r.n_frames > 1]
-        stated = first.record.get("save_every_ps")
-        interval_ps = intervals[0] if intervals else float(stated) if isinstance(stated, int | float) else 1.0
-        if any(abs(other - interval_ps) > 1e-6 * interval_ps for other in intervals):
-            raise InputError(f"{out}: its replicas differ in the time between frames; join those of one interval.")
-        columns = [] if out.suffix.lower() in _WITH_COMPANIONS else list(_COLUMNS)
-        columns = [c for c in columns if all(getattr(r, f"read_{c}")(0, 1) is not None for r in readers)]
-        starts = np.cumsum([0, *(r.n_frames for r in readers)]).tolist()
-        replicas = [
-            {"file": r.path.name, "first_frame": begin, "n_frames": r.n_frames, "record": r.record}
-            for r, begin in zip(readers, starts, strict=False)
-        ]
-        complete = all(r.record.get("completed") is not False for r in readers)
-        common = {key: value for key, value in first.record.items() if all(r.record.get(key) == value for r in readers)}
-        record = common | {KEY: {"replicas": replicas}, "completed": False}
-        end_ps = 0.0
-        with open_writer(out, scene, record, overwrite=overwrite, columns=columns) as writer:
-            for reader in readers:
-                if not reader.n_frames:
-                    continue
-                shift_ps = 0.0 if writer.last_time_ps is None else end_ps + interval_ps - float(reader.time_ps[0])
-                for start in range(0, reader.n_frames, _AT_ONCE):
-                    _copy(reader, slice(start, min(start + _AT_ONCE, reader.n_frames)), writer, shift_ps, columns)
-                end_ps = float(reader.time_ps[-1]) + shift_ps
-            writer.update_record({"completed": complete})
-    return out
-
-
-def replicas_of(record: Mapping[str, Any], n_frames: int) -> list[tuple[slice, dict[str, Any]]]:
-    """Return the frames of each replica in a file and what it says of itself: of one that is not joined, all.
-
-    Raises TrajectoryError where the record does not fit the file.
-    """
-    if KEY not in record:
-        return [(slice(0, n_frames), dict(record))]
-    found, at = [], 0
-    for replica in record[KEY]["replicas"]:
-        begin, n = int(replica["first_frame"]), int(replica["n_frames"])
-        if begin != at or begin + n > n_frames:
-            raise TrajectoryError(
-                f"the record of a joined file names {begin + n} frames or more, it holds {n_frames}; join again."
-            )
-        at = begin + n
-        if n:
-            found.append((slice(begin, at), dict(replica["record"])))
-    return found
-
-
-def refuse_joined(reader: TrajectoryReader) -> None:
-    """Raise InputError for a joined file, where time must be unbroken."""
-    if KEY in reader.record:
-        names = [str(replica["file"]) for replica in reader.record[KEY]["replicas"]]
-        raise InputError(f"{reader.path} joins {len(names)} replicas; give them as files ({names[0]}, ...).")
-
-
-def _copy(reader: TrajectoryReader, part: slice, writer: Any, shift_ps: float, columns: Sequence[str]) -> None:
-    frames = (part.start, part.stop)
-    writer.append(
-        reader.read(*frames),
-        reader.time_ps[part] + shift_ps,
-        flags=None if reader.flags is None else reader.flags[part],
-        chunk_idx=None if reader.chunk_idx is None else reader.chunk_idx[part],
-        scalars={name: values[part] for name, values in reader.scalars.items()},
-        velocities_nm_ps=reader.read_velocities(*frames) if "velocities" in columns else None,
-        forces_kj_mol_nm=reader.read_forces(*frames) if "forces" in columns else None,
-        cell_nm=reader.read_cells(*frames),
-    )
 
 
 # ---- objects of MDTraj and MDAnalysis, through memory ---------------------------------------------------------------
@@ -282,36 +173,17 @@ def to_mdanalysis(
     gaps = np.diff(times)
     if len(gaps) and not np.allclose(gaps, gaps[0], rtol=1e-6):
         raise InputError(f"frames between {times[0]:g} and {times[-1]:g} ps are unevenly spaced; take a range that is.")
-    chains = list(dict.fromkeys(scene.chain_of_residue))
-    universe = MDAnalysis.Universe.empty(
-        scene.n_atoms,
-        n_residues=len(scene.residue_names),
-        n_segments=len(chains),
-        atom_resindex=scene.residue_of_atom,
-        residue_segindex=[chains.index(c) for c in scene.chain_of_residue],
-        trajectory=False,
-    )
-    elements = ["" if e == PARTICLE else e for e in scene.elements]
-    attributes = {
-        "names": list(scene.atom_names), "types": elements, "elements": elements, "masses": scene.masses_da,
-        "formalcharges": scene.formal_charges, "resnames": list(scene.residue_names),
-        "resids": np.arange(1, len(scene.residue_names) + 1), "segids": chains,
-        # Of the file, a residue's place in the scene where it has none.
-        "resnums": [int("".join(filter(str.isdigit, text)) or k) for k, text in enumerate(scene.residue_ids, start=1)],
-    }  # fmt: skip
-    for name, values in attributes.items():
-        universe.add_TopologyAttr(name, values)
-    universe.add_TopologyAttr("bonds", [tuple(pair) for pair in scene.bonds.tolist()])
     dimensions = None
     if cells is not None:
         lengths, angles = lengths_and_angles(cells)
         dimensions = np.concatenate([lengths * 10.0, angles], axis=1).astype(np.float32)
-    step_ps = float(gaps[0]) if len(gaps) else 1.0
-    first_ps = float(times[0]) if len(times) else 0.0
-    universe.load_new(
-        positions * np.float32(10.0), format=MemoryReader, order="fac", dimensions=dimensions, dt=step_ps,
-        time_offset=first_ps,
+    universe = MDAnalysis.Universe(
+        scene.to_openmm_topology(), positions * np.float32(10.0), format=MemoryReader, order="fac",
+        dimensions=dimensions, dt=float(gaps[0]) if len(gaps) else 1.0,
+        time_offset=float(times[0]) if len(times) else 0.0,
     )  # fmt: skip
+    universe.atoms.masses = scene.masses_da
+    universe.add_TopologyAttr("formalcharges", scene.formal_charges)
     return universe
 
 
@@ -353,30 +225,21 @@ def frame_weights(path: str | Path) -> Float64Array:
     All replicas of one answer share a scale, mean 1 over all their frames: concatenate them as the frames. Raises
     TrajectoryError for a damaged file, or one that has grown since the weights were written.
     """
-    path = Path(path)
-    with closing(open_trajectory(path)) as reader:
-        n_frames = reader.n_frames
-    store = _store(path)
-    if store.suffix in (".h5", ".hdf5") and store.is_file():
-        with closing(open_hdf5(store)) as file:
-            if WEIGHTS in file:
-                weights = np.asarray(file[WEIGHTS][:], dtype=np.float64)
-                if len(weights) != n_frames:
-                    raise TrajectoryError(
-                        f"{path} holds {n_frames} frames and weights of {len(weights)}: it has grown since they were "
-                        "written; let the run that made it end."
-                    )
-                return weights
-    return np.ones(n_frames)
+    with open_trajectory(path) as reader:
+        weights, n_frames = reader.weights, reader.n_frames
+    if weights is None:
+        return np.ones(n_frames)
+    if len(weights) != n_frames:
+        raise TrajectoryError(
+            f"{path} holds {n_frames} frames and weights of {len(weights)}: it has grown since they were written; let "
+            "the run that made it end."
+        )
+    return weights
 
 
 def write_weights(path: Path, weights: Float64Array) -> None:
     """Write weights `(n_frames,)` into a trajectory of ours, or replace them. Raises InputError for another number of
     them, TrajectoryError for a file of others, StorageError."""
-    with closing(FrameStore(_store(path))) as store:
-        store.write_weights(np.asarray(weights, dtype=np.float64))
-
-
-def _store(path: Path) -> Path:
-    """Return the HDF5 file that holds a trajectory's columns: itself, or what lies beside a DCD."""
-    return next((p for p in companions(path) if p.name.endswith(".meta.h5")), path)
+    store = meta_path(path) if path.suffix.lower() in POSITIONS_ALONE else path
+    with closing(FrameStore(store)) as file:
+        file.write_weights(np.asarray(weights, dtype=np.float64))

@@ -1,54 +1,23 @@
 """What lies beside trajectories: `NAME.pdb` has the topology; `NAME.meta.h5` the rest, where a format holds positions
-alone, as DCD (`dcd_file`) and XTC do.
+alone, as DCD and XTC do.
 
 A trajectory is not read by its PDB, so that may be missing. The text is written here, with every bond and in the
 scene's own atom order: OpenMM's PDBFile writes CONECT records of non-standard residues alone.
-
-`NAME.xtc` holds positions in nm to three decimals and times as float32. Frames are compressed and read by MDTraj. No
-library appends to a file whose last frame is cut short, or cuts one to a number of frames: where each frame ends stands
-in `NAME.meta.h5`, so that a run goes on behind the last whole one.
 """
 
 from __future__ import annotations
 
-import os
-import tempfile
-from abc import abstractmethod
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Any
 
-import h5py
-import numpy as np
-import numpy.typing as npt
-
-from systems.errors import InputError, SurromdError, TrajectoryError, first_line
-from systems.files.whole_file import create_whole, refuse_existing, storage_error, write_whole
+from systems.errors import InputError, TrajectoryError
 from systems.prepare.structure_text import encode, pdb_atom
 from systems.scene import Scene
-from systems.trajectory.base import (
-    CELLS,
-    ENDS,
-    FRAMES,
-    Float32Array,
-    Float64Array,
-    FrameBlock,
-    TrajectoryReader,
-    TrajectoryWriter,
-    add_column,
-    consistent_length,
-    create_store,
-    damage_reported,
-    open_hdf5,
-    unused_top_note,
-)
 
 MOST_ATOMS = 99_999
 # Between these a coordinate in Å fits its columns.
 _LEAST_A, _MOST_A = -999.999, 9999.999
 _OURS = b"REMARK   1 surromd scene"
-_TRAJECTORIES = (".h5", ".hdf5", ".dcd", ".xtc")
+POSITIONS_ALONE = (".dcd", ".xtc")
 
 
 def pdb_text(scene: Scene) -> str:
@@ -85,6 +54,11 @@ def topology_path(trajectory: Path) -> Path:
     return trajectory.with_suffix(".pdb")
 
 
+def meta_path(trajectory: Path) -> Path:
+    """Return the path of `NAME.meta.h5` beside `NAME.dcd` or `NAME.xtc`."""
+    return trajectory.with_suffix(".meta.h5")
+
+
 def is_our_topology(pdb: Path) -> bool:
     """Whether this PDB file is there and was written by us."""
     try:
@@ -94,370 +68,18 @@ def is_our_topology(pdb: Path) -> bool:
         return False
 
 
-def refuse_foreign_topology(trajectory: Path) -> None:
-    """Raise TrajectoryError where `NAME.pdb` of another program would be replaced."""
-    pdb = topology_path(trajectory)
-    if pdb.exists() and not is_our_topology(pdb):
-        raise TrajectoryError(
-            f"{pdb} is not ours and would be replaced by the topology of {trajectory.name}; choose another name for it."
-        )
-
-
 def topology_bytes(scene: Scene) -> bytes:
     """Return what `NAME.pdb` holds; nothing of a scene with more atoms than the format."""
     return pdb_text(scene).encode() if scene.n_atoms <= MOST_ATOMS else b""
 
 
-def refuse_other_topology(trajectory: Path, topology: bytes, *, overwrite: bool) -> None:
-    """Raise TrajectoryError where `NAME.pdb` is another program's, or not `topology` and still needed: beside another
-    trajectory of that name, or without `overwrite`."""
-    refuse_foreign_topology(trajectory)
-    pdb = topology_path(trajectory)
-    if not pdb.exists() or not topology or _atoms(pdb.read_bytes()) == _atoms(topology):
-        return
-    others = [trajectory.with_suffix(s) for s in _TRAJECTORIES if s != trajectory.suffix.lower()]
-    beside = next((other for other in others if other.exists()), None)
-    if beside is not None:
-        raise TrajectoryError(f"{pdb} is the topology of {beside.name}, of other atoms; choose another name.")
-    if not overwrite:
-        raise TrajectoryError(f"{pdb} exists already, of other atoms; overwrite it, or choose another name.")
-
-
-def write_topology(trajectory: Path, topology: bytes) -> None:
-    """Write `NAME.pdb`, where there is a topology. Raises StorageError."""
-    if topology:
-        create_whole(topology_path(trajectory), topology)
-
-
-def _atoms(pdb: bytes) -> list[bytes]:
-    """Return a file's atoms in order, without their positions."""
-    return [line[:30] + line[54:] for line in pdb.splitlines() if line.startswith((b"ATOM", b"HETATM"))]
-
-
-# ---- formats that hold positions alone ------------------------------------------------------------------------------
-
-
-SUFFIXES = (".dcd", ".xtc")
-
-
-def companions(path: Path) -> tuple[Path, Path]:
-    """Return the paths of `NAME.pdb` and `NAME.meta.h5` that stand beside `NAME.dcd` or `NAME.xtc`."""
-    return topology_path(path), path.with_suffix(".meta.h5")
-
-
-class CompanionWriter(TrajectoryWriter):
-    """Writes frames and their companions; see `systems.trajectory.codec.open_writer` for the arguments and errors.
-
-    Frames go to the file first and to `NAME.meta.h5` then: what lies behind the frames that it counts was in flight.
-    """
-
-    def __init__(
-        self, path: Path, scene: Scene, record: dict[str, Any], *, append: bool, overwrite: bool, run_id: str = ""
-    ) -> None:
-        self._fd = -1
-        self._pdb, self._meta = companions(path)
-        if not append:
-            self._create(path, scene, record, overwrite, run_id)
-        if not self._meta.exists():
-            raise TrajectoryError(f"{path} has no {self._meta.name} beside it and cannot be continued.")
-        super().__init__(path, self._meta, scene, record, append=append)
-        try:
-            self._fd = os.open(path, os.O_RDWR | getattr(os, "O_CLOEXEC", 0))
-            self._set_length(self.n_frames)
-        except OSError as error:
-            self.close()
-            raise storage_error(path, error, "nothing was changed") from error
-
-    def _create(self, path: Path, scene: Scene, record: dict[str, Any], overwrite: bool, run_id: str) -> None:
-        for file in (path, self._meta):
-            refuse_existing(file, overwrite)
-        for suffix in SUFFIXES:
-            other = path.with_suffix(suffix)
-            if suffix != path.suffix.lower() and other.exists() and self._meta.exists():
-                raise TrajectoryError(f"{self._meta} is the record of {other.name}; choose another name.")
-        topology = topology_bytes(scene)
-        refuse_other_topology(path, topology, overwrite=overwrite)
-        made = [file for file in (self._meta, self._pdb, path) if not file.exists()]
-        try:
-            create_store(
-                self._meta,
-                scene,
-                record,
-                self._lay_out,
-                overwrite=overwrite,
-                run_id=run_id,
-                checksums=(FRAMES,) if scene.cell_nm is None else (FRAMES, CELLS),
-            )
-            write_topology(path, topology)
-            create_whole(path, self._head(scene))
-        except SurromdError:
-            for file in made:
-                with suppress(OSError):
-                    file.unlink(missing_ok=True)
-            raise
-
-    @abstractmethod
-    def _lay_out(self, file: h5py.File) -> None:
-        """Make the columns of `NAME.meta.h5` that this format needs."""
-
-    @abstractmethod
-    def _head(self, scene: Scene) -> bytes:
-        """Return what a file without frames holds."""
-
-    @abstractmethod
-    def _encoded(self, block: FrameBlock) -> tuple[bytes, dict[str, npt.NDArray[Any]], dict[str, npt.NDArray[Any]]]:
-        """Return a block as the file has it, the columns that go with it, and what has a checksum (`FrameStore`).
-
-        Raises InputError for frames that the format cannot hold.
-        """
-
-    @abstractmethod
-    def _offset(self, n_frames: int) -> int:
-        """Return where in the file the first `n_frames` frames end, bytes."""
-
-    def _restate(self, n_frames: int) -> None:
-        """Make the header say so many frames, where there is one: one small write, which is atomic. Raises OSError."""
-
-    def _append(self, block: FrameBlock) -> None:
-        with self._open():
-            self._check_flags(block)
-        kind = self.path.suffix[1:].upper()
-        if block.velocities_nm_ps is not None or block.forces_kj_mol_nm is not None:
-            raise InputError(
-                f"{self.path}: {kind} files hold positions only; write an .h5 to keep velocities or forces."
-            )
-        if block.cell_nm is not None and self.scene.cell_nm is None:
-            raise InputError(f"{self.path}: {self.scene.name!r} has no periodic cell, but frames came with one.")
-        data, columns, stored = self._encoded(block)
-        try:
-            start = self._offset(self.n_frames)
-            write_whole(self._fd, data, start)
-            self._written(block, columns)
-            self._restate(self.n_frames + len(block))
-            os.ftruncate(self._fd, start + len(data))
-            os.fsync(self._fd)
-            self._store(block, columns, stored)
-        except BaseException as error:
-            failed = self.failed(error) if isinstance(error, OSError) else error
-            # The companion may hold these frames, where its own last step failed: what it lacks is cut off. Taking
-            # space back needs none, so this also succeeds on a full disk; and frames too many do no harm.
-            with suppress(OSError, SurromdError), open_hdf5(self._meta) as file:
-                n_frames = consistent_length(file, self._meta)
-                self._forgotten(n_frames)
-                self._set_length(n_frames)
-            self.close()
-            raise failed from error
-
-    def _cells(self, block: FrameBlock) -> Float64Array | None:
-        """The box vectors `(n, 3, 3)` nm of a block, the scene's own where it came without; None without a cell."""
-        if self.scene.cell_nm is None or block.cell_nm is not None:
-            return block.cell_nm
-        return np.broadcast_to(np.asarray(self.scene.cell_nm, dtype=np.float64), (len(block), 3, 3))
-
-    def _written(self, block: FrameBlock, columns: dict[str, npt.NDArray[Any]]) -> None:
-        """Remember what later frames depend on."""
-
-    def _forgotten(self, n_frames: int) -> None:
-        """Forget what is remembered of frames behind the first `n_frames`."""
-
-    def _set_length(self, n_frames: int) -> None:
-        """Make header and file size say `n_frames`."""
-        self._restate(n_frames)
-        os.ftruncate(self._fd, self._offset(n_frames))
-
-    def truncate(self, n_frames: int) -> None:
-        super().truncate(n_frames)
-        self._forgotten(n_frames)
-        try:
-            self._set_length(n_frames)
-        except OSError as error:
-            raise self.failed(error) from error
-
-    def close(self) -> None:
-        if self._fd >= 0:
-            os.close(self._fd)
-            self._fd = -1
-        super().close()
-
-
-class CompanionReader(TrajectoryReader):
-    """Reads positions from one file and all else from `NAME.meta.h5`; both are refused unless they fit each other."""
-
-    def _read_companion(self, top: Path | None, *, with_ends: bool) -> npt.NDArray[np.int64]:
-        """Take what the companion says; return where each frame ends `(n_frames,)`, of an XTC file."""
-        meta = companions(self.path)[1]
-        with open_hdf5(meta) as file, damage_reported(meta):
-            if "surromd" not in file:
-                raise TrajectoryError(f"{meta} is not the record of {self.path.name}; move it to read the DCD alone.")
-            self._read_stored(file, meta)
-            ends: npt.NDArray[np.int64] = file[ENDS][: self.n_frames] if with_ends else np.empty(0, dtype=np.int64)
-        assert self.scene is not None
-        self.n_atoms = self.scene.n_atoms
-        if self._scene_of(top) is not None:
-            self.notes = (unused_top_note(top),)
-        return ends
-
-
-def unfit_size(path: Path, what_is_there: str, recorded: str) -> TrajectoryError:
-    """Return the error for a file that does not hold the frames which its companion records."""
-    return TrajectoryError(
-        f"{path} holds {what_is_there} where {companions(path)[1].name} records {recorded}: one of them is cut short "
-        "or replaced; restore both from one copy."
-    )
-
-
-# ---- XTC ------------------------------------------------------------------------------------------------------------
-
-
-# Three decimals in 32-bit integers.
-_MOST_NM = 2.0e6
-_DECODED_AT_ONCE = 4096
-
-
-class XtcWriter(CompanionWriter):
-    """Writes an XTC and its companions; see `systems.trajectory.codec.open_writer` for the arguments and errors."""
-
-    _ends: npt.NDArray[np.int64]
-
-    def _lay_out(self, file: h5py.File) -> None:
-        add_column(file, "time", 0, "<f8")
-        add_column(file, ENDS, 0, "<i8")
-
-    def _head(self, scene: Scene) -> bytes:
-        return b""
-
-    def _adopt(self) -> None:
-        if ENDS not in self.file:
-            raise TrajectoryError(f"{self._meta} is not the record of {self.path.name}; choose another name.")
-        self._ends = self.file[ENDS][: self.n_frames]
-        _check_size(self.path, self._ends, completed=False)
-
-    def _offset(self, n_frames: int) -> int:
-        return int(self._ends[n_frames - 1]) if n_frames else 0
-
-    def _encoded(self, block: FrameBlock) -> tuple[bytes, dict[str, npt.NDArray[Any]], dict[str, npt.NDArray[Any]]]:
-        beyond = ~(np.abs(block.positions_nm) < _MOST_NM).all(axis=(1, 2))
-        if beyond.any():
-            raise InputError(
-                f"{self.path}: frame {self.n_frames + int(np.argmax(beyond))} has positions that are not finite or too "
-                "large for an XTC; write an .h5."
-            )
-        cells = self._cells(block)
-        data, sizes = _compressed(block.positions_nm, block.time_ps, self._steps(block.time_ps), cells)
-        # Checksums are of what a reader gets.
-        positions, boxes = _decompressed(data, len(block), self.path, self.n_frames)
-        stored = {FRAMES: positions} if cells is None else {FRAMES: positions, CELLS: boxes}
-        return data, {ENDS: self._offset(self.n_frames) + np.cumsum(sizes)}, stored
-
-    def _steps(self, time_ps: Float64Array) -> npt.NDArray[np.int32]:
-        """Return the steps `(n,)` that go with times: of the integrator where the record states it, else frames."""
-        timestep = self.record.get("timestep_ps")
-        if isinstance(timestep, int | float) and timestep > 0 and time_ps[-1] / timestep < 2**31 - 1:
-            return np.rint(time_ps / timestep).astype(np.int32)
-        return np.arange(self.n_frames, self.n_frames + len(time_ps), dtype=np.int32)
-
-    def _written(self, block: FrameBlock, columns: dict[str, npt.NDArray[Any]]) -> None:
-        self._ends = np.concatenate([self._ends[: self.n_frames], columns[ENDS]])
-
-    def _forgotten(self, n_frames: int) -> None:
-        self._ends = self._ends[:n_frames]
-
-
-class XtcReader(CompanionReader):
-    """Reads our XTC files with their companions; those of other programs MDTraj reads (`foreign_readers`).
-
-    Raises TrajectoryError when the file is cut short or damaged, InputError when `top` does not fit.
-    """
-
-    def __init__(self, path: Path, top: Path | None) -> None:
-        super().__init__(path)
-        self._ends = self._read_companion(top, with_ends=True)
-        _check_size(path, self._ends, completed=self.record.get("completed") is True)
-        if self.scene is not None and not self.scene.positions_nm.any():
-            self.scene = self._at_first_frame(self.scene)
-
-    def _read(self, start: int, stop: int, stride: int) -> Float32Array:
-        frames = np.concatenate([x[::stride] for x, _ in self._decoded(start, stop, stride)])
-        self._check_read(FRAMES, frames, slice(start, stop, stride))
-        return frames
-
-    def _read_cells(self, start: int, stop: int, stride: int) -> Float64Array | None:
-        if CELLS not in self.checksums:
-            return None
-        if start >= stop:
-            return np.empty((0, 3, 3))
-        cells = np.concatenate([boxes[::stride] for _, boxes in self._decoded(start, stop, stride)])
-        self._check_read(CELLS, cells, slice(start, stop, stride))
-        return cells.astype(np.float64)
-
-    def _decoded(self, start: int, stop: int, stride: int) -> Iterator[tuple[Float32Array, Float32Array]]:
-        """Yield positions and boxes of frames `start:stop`, in blocks that begin at multiples of the stride."""
-        each = max(_DECODED_AT_ONCE // stride, 1) * stride
-        with self.path.open("rb") as file:
-            for first in range(start, stop, each):
-                last = min(first + each, stop)
-                begin = int(self._ends[first - 1]) if first else 0
-                file.seek(begin)
-                data = file.read(int(self._ends[last - 1]) - begin)
-                yield _decompressed(data, last - first, self.path, first)
-
-
-def is_ours(path: Path) -> bool:
-    """Whether `NAME.meta.h5` beside an XTC is the record of it. Raises TrajectoryError where that cannot be read."""
-    meta = companions(path)[1]
-    if not meta.exists():
-        return False
-    with open_hdf5(meta) as file:
-        return ENDS in file
-
-
-def _check_size(path: Path, ends: npt.NDArray[np.int64], *, completed: bool) -> None:
-    """Raise TrajectoryError unless the XTC holds the recorded frames; behind them a run may have some in flight."""
-    end, size = (int(ends[-1]) if len(ends) else 0), path.stat().st_size
-    if size < end or (size > end and completed):
-        raise unfit_size(path, f"{size} bytes", f"{len(ends)} frames of {end}")
-
-
-def _compressed(
-    positions_nm: Float32Array, time_ps: Float64Array, steps: npt.NDArray[np.int32], cells_nm: npt.ArrayLike | None
-) -> tuple[bytes, npt.NDArray[np.int64]]:
-    """Return frames as an XTC file has them, and the size of each, bytes."""
-    from mdtraj.formats import XTCTrajectoryFile
-
-    boxes = None if cells_nm is None else np.ascontiguousarray(cells_nm, dtype=np.float32)
-    with _scratch() as path:
-        with XTCTrajectoryFile(str(path), "w") as file:
-            file.write(np.ascontiguousarray(positions_nm), time=time_ps.astype(np.float32), step=steps, box=boxes)
-        data = path.read_bytes()
-        with XTCTrajectoryFile(str(path)) as file:
-            starts = np.asarray(file.offsets, dtype=np.int64)
-    return data, np.diff(np.append(starts, len(data)))
-
-
-def _decompressed(data: bytes, n_frames: int, path: Path, first: int) -> tuple[Float32Array, Float32Array]:
-    """Return positions `(n_frames, n_atoms, 3)` and box vectors `(n_frames, 3, 3)` nm of frames' bytes.
-
-    Raises TrajectoryError, which says where in `path`, when they are damaged.
-    """
-    from mdtraj.formats import XTCTrajectoryFile
-
-    with _scratch() as copy:
-        copy.write_bytes(data)
-        try:
-            with XTCTrajectoryFile(str(copy)) as file:
-                positions, _, _, boxes = file.read()
-        except Exception as error:  # MDTraj raises several kinds
-            raise TrajectoryError(
-                f"{path} is damaged in frames {first} to {first + n_frames} ({first_line(error)}); restore it from a "
-                "whole copy."
-            ) from error
-    if len(positions) != n_frames:
-        raise TrajectoryError(f"{path} is damaged at frame {first + len(positions)}; restore it from a whole copy.")
-    return positions, boxes
-
-
-@contextmanager
-def _scratch() -> Any:
-    """Make a path for MDTraj's library in C, which takes ASCII and files alone."""
-    with tempfile.TemporaryDirectory(prefix="surromd-") as folder:
-        yield Path(folder) / "frames.xtc"
+def refuse_other_companions(trajectory: Path) -> None:
+    """Raise TrajectoryError where `NAME.pdb` is another program's, or `NAME.meta.h5` is of another trajectory."""
+    pdb, suffix = topology_path(trajectory), trajectory.suffix.lower()
+    if pdb.exists() and not is_our_topology(pdb):
+        raise TrajectoryError(
+            f"{pdb} is not ours and would be replaced by the topology of {trajectory.name}; choose another name for it."
+        )
+    for other in (trajectory.with_suffix(s) for s in POSITIONS_ALONE if suffix in POSITIONS_ALONE and s != suffix):
+        if other.exists() and meta_path(other).exists():
+            raise TrajectoryError(f"{meta_path(other)} is the record of {other.name}; choose another name.")

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import os
 import warnings
-from dataclasses import dataclass
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -25,127 +25,102 @@ from systems.chemistry.distance_bonds import lengths_and_angles, read_cells
 from systems.errors import TrajectoryError
 from systems.files.whole_file import write_whole
 from systems.scene import Scene
-from systems.trajectory.base import CELLS, ENDS, FRAMES, Float32Array, Float64Array, FrameBlock, add_column, open_hdf5
-from systems.trajectory.companion_writer import (
-    CompanionReader,
-    CompanionWriter,
-    companions,
-    is_our_topology,
-    unfit_size,
+from systems.trajectory.companion_writer import is_our_topology, meta_path, topology_path
+from systems.trajectory.store import (
+    CELLS,
+    ENDS,
+    FRAMES,
+    Columns,
+    Float32Array,
+    Float64Array,
+    FrameBlock,
+    add_column,
 )
+from systems.trajectory.xtc_file import CompanionReader, CompanionWriter, check_size, is_of_xtc
 
 AKMA_PS = 4.888821e-2  # the value MDAnalysis and OpenMM use for CHARMM's unit of time
 _HEADER_BYTES = 92
 _MOST_ATOMS = 2**31 // 13  # a frame's bytes are counted in 32 bits
 _TITLE = b"Written by surromd"
 _LAMMPS_TITLE = b"Written by LAMMPS"
-_LEAST_LAMMPS_FS = 0.05
-_LAMMPS_NOTE = "written by LAMMPS; its time step is taken to be in fs (`units real`)."
-_LAMMPS_UNKNOWN = (
-    "written by LAMMPS with a time step that is too short for fs (`units metal` or `lj`); its times are not used."
-)
+_LAMMPS_NOTE = "written by LAMMPS, whose time step may be in fs, ps or reduced units; it is not used: state `dt_ps`."
 _LAST_VERSION_WITH_ANGLES = 24
 _LIKELY_DEG = (40.0, 140.0)
 
 
-@dataclass(frozen=True)
 class DcdLayout:
-    """Where the frames of a DCD lie, and what its header says. Sizes in bytes."""
+    """Where the frames of a DCD lie, and what its header says. Sizes in bytes.
 
-    n_atoms: int
-    first_frame_at: int
-    byte_order: str = "<"
-    has_cell: bool = False
-    n_frames_in_header: int = 0
-    first_time_ps: float = 0.0
-    interval_ps: float = 0.0
-    file_bytes: int = 0
-    path: Path = Path()
-    has_our_title: bool = False
-    states_time: bool = True
-    charmm_version: int = 24
-    notes: tuple[str, ...] = ()
+    `interval_ps` between frames is 1 where no time step is stated. Raises TrajectoryError when the header is damaged or
+    of a kind that is not supported.
+    """
 
-    def is_ours(self, n_atoms: int, *, has_cell: bool) -> bool:
-        """Whether frames lie as we write them."""
-        return (self.n_atoms, self.byte_order, self.has_cell) == (n_atoms, "<", has_cell)
-
-    @staticmethod
-    def read(path: Path) -> DcdLayout:
-        """Read the header. Raises TrajectoryError when it is damaged or of a kind that is not supported."""
+    def __init__(self, path: Path) -> None:
         try:
             with path.open("rb") as file:
                 head = file.read(_HEADER_BYTES)
-                size = os.fstat(file.fileno()).st_size
+                self.file_bytes = os.fstat(file.fileno()).st_size
                 order = next((o for o in "<>" if np.frombuffer(head[:4], f"{o}i4")[:1] == 84), "")
                 if len(head) < _HEADER_BYTES or not order or head[4:8] != b"CORD":
-                    what = "is empty" if size == 0 else "is not a DCD file of the 32-bit kind"
+                    what = "is not a DCD file of the 32-bit kind" if self.file_bytes else "is empty"
                     raise TrajectoryError(f"{path} {what}.")
-                fields = np.frombuffer(head[8:88], f"{order}i4")
-                charmm = fields[19] != 0
-                delta = np.frombuffer(head[44:52], f"{order}f4" if charmm else f"{order}f8")[0]
-                if fields[8] != 0 or (charmm and fields[11] != 0):
+                fields = np.frombuffer(head[8:88], f"{order}i4").tolist()
+                is_charmm = fields[19] != 0
+                delta = float(np.frombuffer(head[44:52], f"{order}f4" if is_charmm else f"{order}f8")[0])
+                if fields[8] != 0 or (is_charmm and fields[11] != 0):
                     raise TrajectoryError(f"{path} has fixed atoms or a fourth dimension; convert it first.")
-                title = int(np.frombuffer(file.read(4), f"{order}i4")[0])
-                titles = file.read(title + 4)
-                _, n_atoms, _ = np.frombuffer(file.read(12), f"{order}i4").tolist()
-                first_frame_at = file.tell()
+                title = file.read(int(np.frombuffer(file.read(4), f"{order}i4")[0]) + 4)
+                _, self.n_atoms, _ = np.frombuffer(file.read(12), f"{order}i4").tolist()
+                self.first_frame_at = file.tell()
         except OSError as error:
-            reason = "does not exist" if isinstance(error, FileNotFoundError) else f"cannot be read: {error.strerror}"
-            raise TrajectoryError(f"{path} {reason}.") from error
+            raise TrajectoryError(f"{path} cannot be read: {error.strerror}.") from error
         except (ValueError, IndexError) as error:
             raise TrajectoryError(f"{path} is cut short inside its header.") from error
-        if not 1 <= n_atoms < _MOST_ATOMS:
-            raise TrajectoryError(f"{path} is damaged: its header states {n_atoms} atoms.")
-        unit_ps, notes = AKMA_PS, list[str]()
-        # MDTraj and VMD write a time step of one unit, whatever the times were.
-        states_time = not (delta == 1.0 and fields[2] == 1)
-        if _LAMMPS_TITLE in titles:
-            # LAMMPS writes its time step in its own units, which no title names: fs (real), ps (metal) or reduced ones.
-            unit_ps, states_time = 1e-3, bool(delta >= _LEAST_LAMMPS_FS)
-            notes = [_LAMMPS_NOTE if states_time else _LAMMPS_UNKNOWN]
+        if not 1 <= self.n_atoms < _MOST_ATOMS:
+            raise TrajectoryError(f"{path} is damaged: its header states {self.n_atoms} atoms.")
+        self.path, self.byte_order, self.charmm_version = path, order, fields[19]
+        self.n_frames_stated, self.has_our_title = fields[0], _TITLE in title
+        self.has_cell = is_charmm and fields[10] != 0
+        is_lammps = _LAMMPS_TITLE in title
+        self.notes = (_LAMMPS_NOTE,) if is_lammps else ()
+        every = max(fields[2], 1)
         # The time step is float32: digits beyond its seventh are noise.
-        interval_ps = float(f"{float(delta) * unit_ps * max(int(fields[2]), 1):.6g}")
-        states_time = states_time and bool(np.isfinite(interval_ps) and interval_ps > 0)
-        if not (np.isfinite(interval_ps) and interval_ps > 0):
-            interval_ps = 1.0
-        first_time_ps = interval_ps * int(fields[1]) / max(int(fields[2]), 1)
-        return DcdLayout(n_atoms, first_frame_at, order, bool(charmm and fields[10]), int(fields[0]),
-                         first_time_ps, interval_ps, size, path, _TITLE in titles, states_time,
-                         int(fields[19]), tuple(notes))  # fmt: skip
-
-    @property
-    def frame_dtype(self) -> np.dtype[Any]:
-        """The NumPy record of one frame, block lengths included."""
-        o = self.byte_order
-        cell = [("cell", f"{o}i4", (14,))] if self.has_cell else []
+        self.interval_ps = float(f"{delta * AKMA_PS * every:.6g}")
+        has_step = bool(np.isfinite(self.interval_ps) and self.interval_ps > 0)
+        # MDTraj and VMD write a time step of one unit, whatever the times were; LAMMPS one in units of its own.
+        self.states_time = has_step and not is_lammps and not (delta == 1.0 and fields[2] == 1)
+        self.interval_ps = self.interval_ps if has_step else 1.0
+        self.first_time_ps = self.interval_ps * fields[1] / every
+        # One frame, block lengths included.
+        cell = [("cell", f"{order}i4", (14,))] if self.has_cell else []
         axes = [
             entry
             for k in range(3)
-            for entry in ((f"before{k}", f"{o}i4"), (f"x{k}", f"{o}f4", (self.n_atoms,)), (f"after{k}", f"{o}i4"))
+            for entry in (
+                (f"before{k}", f"{order}i4"),
+                (f"x{k}", f"{order}f4", (self.n_atoms,)),
+                (f"after{k}", f"{order}i4"),
+            )
         ]
-        return np.dtype(cell + axes)
+        self.frame_dtype = np.dtype([*cell, *axes])
 
     def offset(self, frame: int) -> int:
-        return self.first_frame_at + frame * int(self.frame_dtype.itemsize)
-
-    def times_ps(self, n_frames: int) -> Float64Array:
-        return self.first_time_ps + self.interval_ps * np.arange(n_frames, dtype=np.float64)
+        return self.first_frame_at + frame * self.frame_dtype.itemsize
 
     def whole_frames(self) -> int:
         """Return the number of frames in the file. Raises TrajectoryError when it ends inside one or lacks some.
 
         Other programs write the number they intend (or 0) and never correct it, so theirs is only warned about.
         """
-        n, rest = divmod(self.file_bytes - self.first_frame_at, int(self.frame_dtype.itemsize))
-        stated = self.n_frames_in_header
-        if stated not in (0, n) and not rest and not self.has_our_title:
-            warnings.warn(f"{self.path}: the header states {stated} frames, the file holds {n}.", stacklevel=2)
-        elif rest or stated not in (0, n):
+        n, rest = divmod(self.file_bytes - self.first_frame_at, self.frame_dtype.itemsize)
+        stated = self.n_frames_stated
+        if rest or (stated not in (0, n) and self.has_our_title):
             raise TrajectoryError(
                 f"{self.path} is cut short or damaged: its header states {stated} frames, {n} are whole; "
                 "restore it from a whole copy."
             )
+        if stated not in (0, n):
+            warnings.warn(f"{self.path}: the header states {stated} frames, the file holds {n}.", stacklevel=2)
         return n
 
 
@@ -185,7 +160,7 @@ def cells_of_blocks(
     """Return box vectors `(n, 3, 3)` nm of unit-cell blocks `(n, 14)`, None of such as hold zeros.
 
     Between the lengths stand angles in degrees (most programs), their cosines (NAMD), or the elements of CHARMM's
-    symmetric shape matrix in Å (version 25 on), whose rows are the box vectors: it is known by numbers that are no
+    symmetric shape matrix in Å (version 25 on), whose rows are the box vectors: recognised by numbers that are no
     angles. Raises ValueError where the numbers are none of the three.
     """
     raw = np.ascontiguousarray(blocks[:, 1:13]).view(f"{byte_order}f8").astype(np.float64)
@@ -238,75 +213,68 @@ class DcdWriter(CompanionWriter):
     """Writes a DCD and its companions; see `systems.trajectory.codec.open_writer` for the arguments and errors."""
 
     _layout: DcdLayout
-    _first_times: Float64Array
 
-    def _lay_out(self, file: h5py.File) -> None:
+    def _lay_out(self, file: h5py.File, scene: Scene, columns: Sequence[str]) -> None:
         add_column(file, "time", 0, "<f8")
 
     def _head(self, scene: Scene) -> bytes:
         return header_bytes(0, 0, 1, 0.0, has_cell=scene.cell_nm is not None) + title_bytes(scene.n_atoms)
 
     def _adopt(self) -> None:
-        layout = DcdLayout.read(self.path)
-        is_ours = layout.is_ours(self.scene.n_atoms, has_cell=self.scene.cell_nm is not None)
-        if not is_ours or ENDS in self.file:
+        self._layout = layout = DcdLayout(self.path)
+        ours = (self.scene.n_atoms, "<", self.scene.cell_nm is not None)
+        if (layout.n_atoms, layout.byte_order, layout.has_cell) != ours or ENDS in self.file:
             raise TrajectoryError(f"{self.path} was not written by surromd and cannot be continued; take another name.")
-        _check_against_meta(self.path, layout, self.n_frames, completed=False)
-        self._layout, self._first_times = layout, self.first_times_ps()
+        check_size(self.path, self.n_frames, layout.offset(self.n_frames), completed=False)
 
-    def _offset(self, n_frames: int) -> int:
+    def _offset(self, n_frames: int, record: h5py.File) -> int:
         return self._layout.offset(n_frames)
 
-    def _encoded(self, block: FrameBlock) -> tuple[bytes, dict[str, npt.NDArray[Any]], dict[str, npt.NDArray[Any]]]:
+    def _encoded(self, block: FrameBlock) -> tuple[bytes, Columns, Columns]:
         frames = np.empty(len(block), dtype=self._layout.frame_dtype)
         angstrom = block.positions_nm * np.float32(10.0)
-        stored: dict[str, npt.NDArray[Any]] = {FRAMES: angstrom}
+        stored: Columns = {FRAMES: angstrom}
         for axis in range(3):
             frames[f"before{axis}"] = frames[f"after{axis}"] = 4 * self.scene.n_atoms
             frames[f"x{axis}"] = angstrom[:, :, axis]
-        if (cells := self._cells(block)) is not None:
-            stored[CELLS] = frames["cell"] = cell_blocks(cells)
+        if block.cell_nm is not None:
+            stored[CELLS] = frames["cell"] = cell_blocks(block.cell_nm)
         return frames.tobytes(), {}, stored
 
-    def _restate(self, n_frames: int) -> None:
-        first, nsavc, timestep_ps = 0, 1, 0.0
-        if len(self._first_times):
-            first, nsavc, timestep_ps = step_fields(self._first_times, self.record)
-        write_whole(self._fd, header_bytes(n_frames, first, nsavc, timestep_ps, has_cell=self._layout.has_cell), 0)
-
-    def _written(self, block: FrameBlock, columns: dict[str, npt.NDArray[Any]]) -> None:
-        self._first_times = np.concatenate([self._first_times, block.time_ps])[:2]
-
-    def _forgotten(self, n_frames: int) -> None:
-        self._first_times = self._first_times[:n_frames]
+    def _restate(self, n_frames: int, first_times_ps: Float64Array) -> None:
+        step = step_fields(first_times_ps, self.record) if len(first_times_ps) else (0, 1, 0.0)
+        write_whole(self._fd, header_bytes(n_frames, *step, has_cell=self._layout.has_cell), 0)
 
 
 class DcdReader(CompanionReader):
     """Reads our DCD files with their companions, and plain ones (32-bit, no fixed atoms) of other programs.
 
     Without companions times come from the header (1 ps a frame where it states no time step) and `scene` from `top`.
-    Raises TrajectoryError when the file is cut short or damaged, InputError when `top` does not fit.
+    Raises TrajectoryError when the file is cut short or damaged, InputError where `top` is needed and does not fit.
     """
 
     def __init__(self, path: Path, top: Path | None) -> None:
         super().__init__(path)
-        self._layout = layout = DcdLayout.read(path)
-        pdb, meta = companions(path)
-        if meta.exists() and not _is_of_xtc(meta):
-            self._read_companion(top, with_ends=False)
-            _check_against_meta(path, layout, self.n_frames, completed=self.record.get("completed") is True)
+        self._layout = layout = DcdLayout(path)
+        if meta_path(path).exists() and not is_of_xtc(path):
+            self._read_companion(top)
+            completed = self.record.get("completed") is True
+            check_size(path, self.n_frames, layout.offset(self.n_frames), completed=completed)
             if self.n_atoms != layout.n_atoms:
                 raise TrajectoryError(f"{path} holds {layout.n_atoms} atoms a frame, its record {self.n_atoms}.")
         else:
             self.n_atoms, self.n_frames = layout.n_atoms, layout.whole_frames()
-            self.time_ps, self.times_known = layout.times_ps(self.n_frames), layout.states_time
+            self.time_ps = layout.first_time_ps + layout.interval_ps * np.arange(self.n_frames, dtype=np.float64)
+            self.times_known = layout.states_time
             self.notes = layout.notes
-            self.scene = self._scene_of(top or (pdb if is_our_topology(pdb) else None))
+            top = top or (topology_path(path) if is_our_topology(topology_path(path)) else None)
         self._frames: npt.NDArray[Any] = np.empty(0, dtype=layout.frame_dtype)
         if self.n_frames:
             self._frames = np.memmap(path, layout.frame_dtype, "r", layout.first_frame_at, (self.n_frames,))
-            if self.scene is not None and not self.scene.positions_nm.any():
-                self.scene = self._at_first_frame(self.scene)
+        if self.scene is None and (stated := self._scene_of(top)) is not None:
+            self._take_scene(stated, top)
+            if stated.positions_nm.any():  # a PSF has none
+                self.scene = stated
 
     def _read(self, start: int, stop: int, stride: int) -> Float32Array:
         frames = self._frames[start:stop:stride]
@@ -336,16 +304,3 @@ class DcdReader(CompanionReader):
     def close(self) -> None:
         super().close()
         self._frames = np.empty(0)  # gives the file's pages back
-
-
-def _is_of_xtc(meta: Path) -> bool:
-    with open_hdf5(meta) as file:
-        return ENDS in file
-
-
-def _check_against_meta(path: Path, layout: DcdLayout, n_frames: int, *, completed: bool) -> None:
-    """Raise TrajectoryError unless the DCD holds the recorded frames; behind them a run may have some in flight."""
-    extra = layout.file_bytes - layout.offset(n_frames)
-    if extra < 0 or (extra and completed):
-        whole = (layout.file_bytes - layout.first_frame_at) // layout.frame_dtype.itemsize
-        raise unfit_size(path, f"{whole} whole frames", str(n_frames))

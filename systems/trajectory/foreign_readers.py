@@ -1,10 +1,8 @@
-"""Trajectories of other programs: through the readers of MDTraj, MDAnalysis and ASE, with what these leave out (units
-of NetCDF, TRR frames without positions, odd paths, atoms in another order); H5MD and extended XYZ, read here.
+"""Trajectories of other programs: through MDTraj, MDAnalysis and ASE; extended XYZ, read here.
 
-Which one reads a format, and what it would make up, stands in `foreign_scenes`. What both read MDTraj reads, block by
-block. XYZ: positions in Å; `Lattice`, `pbc` and `Properties` of each frame's second line are read
-(https://github.com/libAtoms/extxyz): `Lattice` holds the rows a, b, c; `Properties` the columns as `name:type:number`
-(`species:S:1:pos:R:3` where there is none).
+Which one reads a format, and what it would make up, stands in `foreign_scenes`. XYZ: positions in Å; `Lattice`, `pbc`
+and `Properties` of each frame's second line are read (https://github.com/libAtoms/extxyz): `Lattice` holds the rows
+a, b, c; `Properties` the columns as `name:type:number` (`species:S:1:pos:R:3` where there is none).
 """
 
 from __future__ import annotations
@@ -18,41 +16,33 @@ import re
 import tempfile
 import warnings
 import zlib
-from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import IO, Any, NamedTuple
 
-import h5py
 import numpy as np
 import numpy.typing as npt
 
 from systems.chemistry.distance_bonds import read_cells
 from systems.chemistry.element_data import element_symbol
 from systems.errors import InputError, TrajectoryError, first_line
-from systems.files.outside import UNREADABLE
 from systems.scene import IntArray
-from systems.trajectory.base import Float32Array, Float64Array, TrajectoryReader, damage_reported, open_hdf5
+from systems.trajectory.base import TrajectoryReader
 from systems.trajectory.foreign_scenes import (
     NONE,
-    SOME,
     Format,
     bonds_completed,
     format_of,
     named_scene,
-    nm_per,
-    ps_per,
     scene_from_mdtraj_topology,
     scene_from_structure,
     scene_from_universe,
 )
+from systems.trajectory.store import Float32Array, Float64Array
 
-_TRR_MAGIC = 1993
-# Of the header's ten sizes: box, virial, pressure, (topology), positions, velocities and forces have bytes behind it.
-_TRR_X = 7
+_NM = 0.1
 # Magic, atoms, step, time, nine numbers of the cell, atoms again; then the precision, a float32.
 _XTC_PRECISION = 56
-_TRR_FLOATS = (2, 3, 4, 7, 8, 9)
 
 
 def unit_note(format_: Format) -> tuple[str, ...]:
@@ -66,57 +56,207 @@ def counted_note(time_ps: Float64Array) -> tuple[str, ...]:
     """Return the line on times `(n_frames,)` that are what MDTraj writes where nobody stated any."""
     if len(time_ps) < 3 or not np.array_equal(time_ps, np.arange(len(time_ps))):
         return ()
-    return ("its times are 0, 1, 2, ... ps, which MDTraj also writes where it was told none; if so, state `dt_ps`.",)
+    return ("its times are 0, 1, 2, ... ps, which MDTraj also writes where none were given; if so, state `dt_ps`.",)
 
 
-def netcdf_units(handle: Any, path: Path) -> tuple[float, float, float]:
-    """Return what one stands for, by `units` and `scale_factor`, in positions (nm), times (ps) and cell lengths (nm).
+def check_same_atoms(names: Sequence[str], first: Sequence[str], path: Path, frame: int) -> None:
+    """Raise TrajectoryError where a frame does not list the atoms of the first frame, in its order."""
+    if list(names) != list(first):
+        raise TrajectoryError(
+            f"{path}: frame {frame} lists other atoms than the first, or in another order; write it again in one order."
+        )
 
-    `handle`: SciPy's or netCDF4's open file, which MDTraj reads raw numbers from. Where no unit is stated Amber's
-    convention counts: Å and ps. Raises TrajectoryError for a unit that is not known.
+
+@contextlib.contextmanager
+def _ascii_path(path: Path) -> Iterator[Path]:
+    """Make a link to a file in a folder of its own: MDTraj's libraries in C take paths of ASCII alone."""
+    if str(path).isascii():
+        yield path
+        return
+    with tempfile.TemporaryDirectory(prefix="surromd-") as folder:
+        link = Path(folder) / f"frames{''.join(path.suffixes[-2:])}"
+        link.symlink_to(path.resolve(), target_is_directory=path.is_dir())
+        yield link
+
+
+def _open_text(path: Path) -> IO[str]:
+    """Open a text file, a compressed one (.gz, .bz2) too."""
+    opened: Any = {".gz": gzip.open, ".bz2": bz2.open}.get(path.suffix.lower(), open)
+    file: IO[str] = opened(path, "rt", encoding="utf-8", errors="replace")
+    return file
+
+
+# ---- MDTraj and MDAnalysis ------------------------------------------------------------------------------------------
+
+
+_PASS_FRAMES = 4096
+_GRO_TIME = re.compile(r"t= *\d+\.\d+")  # as MDTraj looks for it
+
+
+class _InMemory(TrajectoryReader):
+    """Holds all positions `(n, n_atoms, 3)` nm and box vectors `(n, 3, 3)` nm."""
+
+    _positions: Float32Array
+    _cells: Float64Array | None
+
+    def _read(self, start: int, stop: int, stride: int) -> Float32Array:
+        return self._positions[start:stop:stride].copy()
+
+    def _read_cells(self, start: int, stop: int, stride: int) -> Float64Array | None:
+        return None if self._cells is None else self._cells[start:stop:stride].copy()
+
+
+class MdtrajReader(_InMemory):
+    """A format that MDTraj reads, whole into memory.
+
+    Raises TrajectoryError for what MDTraj cannot read, InputError when `top` is needed or does not fit.
     """
-    if hasattr(handle, "set_auto_maskandscale"):
-        handle.set_auto_maskandscale(False)
-    factors: list[float] = []
-    for name, per, usual in (("coordinates", nm_per, "angstrom"), ("time", ps_per, "picosecond"),
-                             ("cell_lengths", nm_per, "angstrom")):  # fmt: skip
-        variable = handle.variables.get(name)
-        unit, factor = getattr(variable, "units", usual), per(getattr(variable, "units", usual))
-        if factor is None:
-            text = unit.decode(errors="replace") if isinstance(unit, bytes) else unit
-            raise TrajectoryError(f"{path}: {name} are in {text!r}, a unit that is not known; write it in Å and ps.")
-        factors.append(factor * float(np.squeeze(getattr(variable, "scale_factor", 1.0))))
-    return factors[0], factors[1], factors[2]
+
+    def __init__(self, path: Path, top: Path | None) -> None:
+        super().__init__(path)
+        self._format = format_of(path)
+        self.notes = unit_note(self._format)
+        stated = None if top is None else scene_from_structure(top, name=path.stem)
+        whole = self._load(None if stated is None or self._format.names_atoms else stated.to_mdtraj_topology())
+        self._positions = np.asarray(whole.xyz, dtype=np.float32)
+        cells = whole.unitcell_vectors
+        self._cells = None if cells is None else np.asarray(cells, dtype=np.float64)
+        self.n_frames, self.n_atoms = whole.n_frames, whole.n_atoms
+        self.time_ps = np.asarray(whole.time, dtype=np.float64)
+        self.times_known = self._format.times != NONE
+        if self._format.name in ("PDB", "GRO"):
+            self._check_text()
+        if stated is None and self.n_frames:
+            made = scene_from_mdtraj_topology(whole.topology, self._positions[0], name=path.stem, source=path.name)
+            stated = bonds_completed(made, self._cells)
+        self._take_scene(stated, top)
+
+    def _load(self, topology: Any) -> Any:
+        import mdtraj
+
+        path = self.path
+        is_mol2 = path.name.lower().endswith(".mol2") and path.is_file()
+        n_molecules = path.read_bytes().count(b"@<TRIPOS>MOLECULE") if is_mol2 else 1
+        if n_molecules > 1:
+            raise InputError(f"{path} holds {n_molecules} molecules, of which MDTraj reads the first; write PDB.")
+        try:
+            if is_mol2:
+                importlib.import_module("pandas")
+            with _ascii_path(path) as seen:
+                return mdtraj.load(str(seen), **({} if topology is None else {"top": topology}))
+        except ImportError as error:
+            lacking = error.name or "a package"
+            raise TrajectoryError(f"{path} cannot be read: MDTraj needs {lacking}, which is not installed.") from error
+        except Exception as error:  # each MDTraj reader raises errors of its own
+            needs = topology is None and not self._format.names_atoms
+            hint = " (a format without topology: give one with `top`)" if needs else ""
+            raise TrajectoryError(f"{path} cannot be read: {first_line(error)}{hint}.") from error
+
+    def _check_text(self) -> None:
+        """Compare the atoms of all frames, which MDTraj takes by their place, and look for the times of GRO titles."""
+        with _open_text(self.path) as file:
+            lines = file.read().splitlines()
+        if self._format.name == "GRO":
+            each = self.n_atoms + 3
+            rows = [line[:15] for k, line in enumerate(lines[: each * self.n_frames]) if 2 <= k % each < each - 1]
+            # Where one title states no time MDTraj counts frames.
+            self.times_known = all(_GRO_TIME.search(line) for line in lines[: self.n_frames * each : each])
+        else:
+            rows = [line[12:27] + line[76:78] for line in lines if line.startswith(("ATOM", "HETATM"))]
+        n = len(rows) // max(self.n_frames, 1)
+        for k in range(1, self.n_frames):
+            check_same_atoms(rows[k * n : (k + 1) * n], rows[:n], self.path, k)
 
 
-def trr_positions(path: Path) -> npt.NDArray[np.bool_]:
-    """Return which frames of a TRR file hold positions `(n_frames,)`, by their headers: MDTraj gives memory that
-    nobody set for the others. Raises TrajectoryError for a damaged header."""
-    found: list[bool] = []
-    with path.open("rb") as file:
-        size = path.stat().st_size
-        while file.tell() + 84 <= size:
-            magic, _, length = np.frombuffer(file.read(12), ">i4").tolist()
-            file.seek(-(-length // 4) * 4, 1)
-            sizes = np.frombuffer(file.read(52), ">i4").tolist()
-            if magic != _TRR_MAGIC or len(sizes) != 13 or min(sizes[:11]) < 0:
-                raise TrajectoryError(f"{path} is damaged after frame {len(found)}.")
-            of_atoms = next((sizes[k] for k in (7, 8, 9) if sizes[k]), 0)
-            double = sizes[2] == 72 if sizes[2] else of_atoms == 24 * sizes[10]
-            file.seek((16 if double else 8) + sum(sizes[k] for k in _TRR_FLOATS), 1)
-            found.append(sizes[_TRR_X] > 0)
-    return np.array(found, dtype=bool)
+class StreamReader(TrajectoryReader):
+    """An XTC or TRR file of another program, or a NetCDF file of Amber's convention, read by MDTraj block by block.
+
+    TRR frames without positions are left out. Raises TrajectoryError for what it cannot read, InputError when `top`
+    does not fit.
+    """
+
+    def __init__(self, path: Path, top: Path | None) -> None:
+        import mdtraj
+
+        super().__init__(path)
+        self._links = contextlib.ExitStack()
+        self._format = format_of(path)
+        self._nm = _NM if self._format.name == "NetCDF (Amber)" else 1.0
+        self._kept: IntArray | None = None
+        self._has_cell, times = True, []
+        try:
+            seen = self._links.enter_context(_ascii_path(path))
+            self._file = mdtraj.open(str(seen))
+            self.n_atoms = int(self._file.read(n_frames=1)[0].shape[1])
+            self._file.seek(0)
+            while True:
+                time = self._file.read(n_frames=_PASS_FRAMES, atom_indices=np.array([0]))[1]
+                if time is None or not len(time):
+                    break
+                times.append(np.asarray(time, dtype=np.float64))
+            self.times_known = bool(times)
+            self.time_ps = np.concatenate(times) if times else np.arange(len(self._file), dtype=np.float64)
+            if self._format.name == "TRR":
+                has, self._has_cell = _trr_frames(seen)
+                self._kept, self.time_ps = np.flatnonzero(has), self.time_ps[has]
+                if not has.all():
+                    self.notes = (f"{(~has).sum()} frames hold no positions and are left out.",)
+        except Exception as error:  # MDTraj raises errors of many classes
+            self._links.close()
+            raise TrajectoryError(f"{path} cannot be read: {first_line(error)}.") from error
+        if self._format.name == "XTC":
+            self.grid_nm = _xtc_grid_nm(path)
+        if self._format.name == "NetCDF (Amber)":
+            self._check_units(self._file._handle.variables)
+        self.n_frames = len(self.time_ps)
+        if not self.n_frames:
+            raise InputError(f"{path} holds no positions.")
+        self.notes += counted_note(self.time_ps) if self.times_known else ()
+        self._take_scene(self._scene_of(top), top)
+
+    def _check_units(self, variables: Any) -> None:
+        """Raise TrajectoryError unless a NetCDF file is in Å and ps: MDTraj takes the numbers as they are."""
+        for name, usual in (("coordinates", "angstrom"), ("time", "picosecond"), ("cell_lengths", "angstrom")):
+            variable = variables.get(name)
+            unit = getattr(variable, "units", usual)
+            unit = unit.decode(errors="replace") if isinstance(unit, bytes) else unit
+            if unit != usual or float(np.squeeze(getattr(variable, "scale_factor", 1.0))) != 1.0:
+                raise TrajectoryError(f"{self.path}: {name} are scaled, or in {unit!r}; write them in {usual}.")
+
+    def _stored(self, start: int, stop: int) -> list[Any]:
+        """Return what MDTraj reads of frames: positions and times, then steps and boxes, or lengths and angles."""
+        kept = np.arange(start, stop) if self._kept is None else self._kept[start:stop]
+        try:
+            self._file.seek(int(kept[0]))
+            stored = self._file.read(n_frames=int(kept[-1] - kept[0]) + 1)
+        except Exception as error:  # MDTraj raises errors of many classes
+            reason = first_line(error)
+            raise TrajectoryError(f"{self.path} is damaged in frames {start} to {stop} ({reason}).") from error
+        return [x if x is None or self._kept is None else np.asarray(x)[kept - kept[0]] for x in stored]
+
+    def _read(self, start: int, stop: int, stride: int) -> Float32Array:
+        block = max(_PASS_FRAMES // stride, 1) * stride
+        parts = [self._stored(k, min(k + block, stop))[0][::stride] for k in range(start, stop, block)]
+        return np.concatenate(parts).astype(np.float32, copy=False) * np.float32(self._nm)
+
+    def _read_cells(self, start: int, stop: int, stride: int) -> Float64Array | None:
+        if start >= stop:
+            return np.empty((0, 3, 3))
+        stored = self._stored(start, stop)
+        if stored[3] is None or not self._has_cell:
+            return None
+        cells = np.asarray(stored[3], dtype=np.float64)[::stride]
+        if self._format.name == "NetCDF (Amber)":
+            return read_cells(np.asarray(stored[2])[::stride] * _NM, cells)
+        return cells if cells.any() else None
+
+    def close(self) -> None:
+        super().close()
+        self._file.close()
+        self._links.close()
 
 
-def trr_has_cell(path: Path) -> bool:
-    """Return whether the first frame of a TRR file states a cell: MDTraj gives memory that nobody set where not."""
-    with path.open("rb") as file:
-        length = int.from_bytes(file.read(12)[8:], "big")
-        file.seek(-(-length // 4) * 4 + 8, 1)
-        return int.from_bytes(file.read(4), "big") > 0
-
-
-def xtc_grid_nm(path: Path) -> float | None:
+def _xtc_grid_nm(path: Path) -> float | None:
     """Return what an XTC file rounds coordinates to, nm, by the precision in its first frame's header (1000: 0.001 nm);
     None where it states none, as of nine atoms or fewer, which are not rounded."""
     with path.open("rb") as file:
@@ -128,277 +268,17 @@ def xtc_grid_nm(path: Path) -> float | None:
     return 1.0 / precision if np.isfinite(precision) and precision > 0 else None
 
 
-class AsciiPath:
-    """A file's path for libraries in C that take ASCII alone: `path` is itself, or a link in a folder of its own."""
+def _trr_frames(path: Path) -> tuple[npt.NDArray[np.bool_], bool]:
+    """Return which frames of a TRR file hold positions `(n_frames,)`, and whether the first states a cell: MDTraj gives
+    memory that nobody set for the others. Raises OSError."""
+    from MDAnalysis.lib.formats.libmdaxdr import TRRFile
 
-    def __init__(self, path: Path) -> None:
-        self.path, self._folder = path, None
-        if str(path).isascii():
-            return
-        with contextlib.suppress(OSError):  # without links the library says what it cannot read
-            self._folder = tempfile.TemporaryDirectory(prefix="surromd-")
-            link = Path(self._folder.name) / f"frames{''.join(path.suffixes[-2:])}"
-            link.symlink_to(path.resolve(), target_is_directory=path.is_dir())
-            self.path = link
-
-    def close(self) -> None:
-        """Remove the link."""
-        if self._folder is not None:
-            self._folder.cleanup()
-        self._folder = None
-
-
-# ---- atoms that move from frame to frame ----------------------------------------------------------------------------
-
-
-def _open_text(path: Path) -> IO[str]:
-    """Open a text file, a compressed one (.gz, .bz2) too."""
-    opened: Any = {".gz": gzip.open, ".bz2": bz2.open}.get(path.suffix.lower(), open)
-    file: IO[str] = opened(path, "rt", encoding="utf-8", errors="replace")
-    return file
-
-
-def order_of(names: Sequence[str], first: Sequence[str], path: Path, frame: int) -> IntArray | None:
-    """Return where each atom of the first frame stands in a later one `(n_atoms,)`, None where nothing moved.
-
-    Raises TrajectoryError where the frames hold different atoms, or moved ones that share a name.
-    """
-    if names == first:
-        return None
-    if len(names) != len(first):
-        raise TrajectoryError(
-            f"{path}: frame {frame} has {len(names)} atoms, not as many as the first ({len(first)}); split the file."
-        )
-    moved = [k for k, (one, two) in enumerate(zip(names, first, strict=True)) if one != two]
-    k, count = moved[0], Counter(first)
-    here = f"{path}: frame {frame} names other atoms than the first (atom {k + 1} is {names[k]!r}, not {first[k]!r})"
-    if Counter(names) != count:
-        raise TrajectoryError(f"{here}; split the file.")
-    if any(count[first[k]] > 1 for k in moved):
-        raise TrajectoryError(f"{here}, and names that occur twice do not tell the order; write it again in one order.")
-    order = np.arange(len(first))
-    place = {names[k]: k for k in moved}
-    order[moved] = [place[first[k]] for k in moved]
-    return order
-
-
-def _pdb_names(path: Path) -> Iterator[list[str]]:
-    """Yield atom name, alternate, residue and element of all atoms of each model of a PDB file."""
-    names: list[str] = []
-    with _open_text(path) as file:
-        for line in file:
-            if line.startswith(("ATOM", "HETATM")):
-                names.append(" ".join(f"{line[12:27]} {line[76:78]}".split()))
-            elif line.startswith("END") and names:
-                yield names
-                names = []
-    if names:
-        yield names
-
-
-def _arc_names(path: Path) -> Iterator[list[str]]:
-    """Yield name and type of all atoms of each frame of a Tinker archive."""
-    with _open_text(path) as file:
-        for title in file:
-            words = title.split()
-            if not words or not words[0].isdigit():
-                return
-            names: list[str] = []
-            while len(names) < int(words[0]) and (row := file.readline().split()):
-                if len(row) > 5 and not row[1].replace(".", "").isdigit():  # else the cell
-                    names.append(f"{row[1]} {row[5]}")
-            yield names
-
-
-def _gro_frames(path: Path) -> Iterator[tuple[str, list[str]]]:
-    """Yield the title, and residue and name of all atoms, of each frame of a GRO file."""
-    with _open_text(path) as file:
-        for title in file:
-            count = file.readline().strip()
-            if not count.isdigit():
-                return
-            names = [" ".join(f"{line[:10]} {line[10:15]}".split()) for line in itertools.islice(file, int(count))]
-            file.readline()
-            yield title, names
-
-
-def _moved_note(moved: dict[int, IntArray]) -> tuple[str, ...]:
-    """Return the line on reordered frames, none where none is."""
-    if not moved:
-        return ()
-    return (f"{len(moved)} frames, from {min(moved)} on, list their atoms in another order; matched by their names.",)
-
-
-# ---- MDTraj and MDAnalysis ------------------------------------------------------------------------------------------
-
-
-_PASS_FRAMES = 4096
-_NM = 0.1
-_GRO_TIME = re.compile(r"t= *\d+\.\d+")  # as MDTraj looks for it
-
-
-class MdtrajReader(TrajectoryReader):
-    """A format that MDTraj reads. XTC, TRR and NetCDF are read block by block, others whole into memory.
-
-    Raises TrajectoryError for what MDTraj cannot read, InputError when `top` is needed or does not fit.
-    """
-
-    def __init__(self, path: Path, top: Path | None) -> None:
-        super().__init__(path)
-        self._format = format_of(path)
-        self.notes = unit_note(self._format)
-        self._whole: Any = None
-        self._file: Any = None
-        self._kept: IntArray | None = None
-        self._ascii = AsciiPath(path)
-        streamed, named = self._format.streamed, self._format.names_atoms
-        try:
-            if streamed:
-                self._open(self._ascii.path)
-        except InputError:
-            self.close()
-            raise
-        except Exception as error:  # each MDTraj reader raises its own kinds
-            self.close()
-            raise TrajectoryError(f"{path} cannot be read: {first_line(error)}.") from error
-        stated = None if top is None else scene_from_structure(top, name=path.stem)
-        if not streamed:
-            self._whole = self._load(path, None if stated is None or named else stated.to_mdtraj_topology())
-        if stated is not None and stated.n_atoms != self.n_atoms:
-            self.close()
-            raise InputError(f"{top} has {stated.n_atoms} atoms, {path} has {self.n_atoms}; give the matching one.")
-        if stated is not None:
-            self.scene = self._at_first_frame(stated)
-        elif not streamed and self.n_frames:
-            first = self._read(0, 1, 1)[0]
-            made = scene_from_mdtraj_topology(self._whole.topology, first, name=path.stem, source=path.name)
-            self.scene = bonds_completed(made, self._read_cells(0, 1, 1))
-
-    def _load(self, path: Path, topology: Any) -> Any:
-        import mdtraj
-
-        is_mol2 = path.name.lower().endswith(".mol2") and path.is_file()
-        n_molecules = path.read_bytes().count(b"@<TRIPOS>MOLECULE") if is_mol2 else 1
-        if n_molecules > 1:
-            raise InputError(f"{path} holds {n_molecules} molecules, of which MDTraj reads the first; write PDB.")
-        try:
-            if is_mol2:
-                importlib.import_module("pandas")
-            frames = mdtraj.load(str(self._ascii.path), **({} if topology is None else {"top": topology}))
-        except ImportError as error:
-            lacking = error.name or "a package"
-            raise TrajectoryError(f"{path} cannot be read: MDTraj needs {lacking}, which is not installed.") from error
-        except Exception as error:
-            needs = topology is None and not self._format.names_atoms
-            hint = " (a format without topology: give one with `top`)" if needs else ""
-            raise TrajectoryError(f"{path} cannot be read: {first_line(error)}{hint}.") from error
-        self.n_frames, self.n_atoms = frames.n_frames, frames.n_atoms
-        self.time_ps, self.times_known = np.asarray(frames.time, dtype=np.float64), self._format.times != NONE
-        suffix = path.name.lower()
-        if suffix.endswith(".gro"):
-            titled = list(_gro_frames(path))
-            self._put_in_order(frames, [names for _, names in titled])
-            # Where one title states no time MDTraj counts frames.
-            self.times_known = all(_GRO_TIME.search(title) for title, _ in titled)
-        elif suffix.endswith((".pdb", ".pdb.gz")):
-            self._put_in_order(frames, _pdb_names(path))
-        elif suffix.endswith(".arc"):
-            self._put_in_order(frames, _arc_names(path))
-        return frames
-
-    def _put_in_order(self, frames: Any, names: Iterable[Sequence[str]]) -> None:
-        """Put the atoms of each frame into the first one's order: MDTraj goes by their place."""
-        first: Sequence[str] = ()
-        moved: dict[int, IntArray] = {}
-        for frame, here in enumerate(names):
-            first = here if frame == 0 else first
-            order = order_of(here, first, self.path, frame)
-            if order is not None:
-                moved[frame] = order
-        if moved and (len(first) != self.n_atoms or max(moved) >= self.n_frames):
-            raise TrajectoryError(
-                f"{self.path}: later frames list their atoms in another order, and MDTraj leaves some out; write it "
-                "again in one order, without alternates."
-            )
-        for frame, order in moved.items():
-            frames.xyz[frame] = frames.xyz[frame][order]
-        self.notes += _moved_note(moved)
-
-    def _open(self, path: Path) -> None:
-        import mdtraj
-
-        self._file = mdtraj.open(str(path))
-        self._nm, ps, self._cell_nm = (0.1, 1.0, 0.1) if self._file.distance_unit == "angstroms" else (1.0, 1.0, 1.0)
-        if self._format.name.startswith("NetCDF"):
-            self._nm, ps, self._cell_nm = netcdf_units(self._file._handle, self.path)
-        if self._format.name == "XTC":
-            self.grid_nm = xtc_grid_nm(self.path)
-        positions, *_ = self._file.read(n_frames=1)
-        self.n_atoms = int(positions.shape[1])
-        self._file.seek(0)
-        times: list[Float64Array] = []
-        while True:
-            _, time, *_ = self._file.read(n_frames=_PASS_FRAMES, atom_indices=np.array([0]))
-            if time is None or not len(time):
-                break
-            times.append(np.asarray(time, dtype=np.float64) * ps)
-        self.times_known = bool(times)
-        self.notes += counted_note(np.concatenate(times)) if times else ()
-        self.time_ps = np.concatenate(times) if times else np.arange(len(self._file), dtype=np.float64)
-        if self._format.positions == SOME:
-            has = trr_positions(self.path)
-            if len(has) == len(self.time_ps) and not has.all():
-                self._kept = np.flatnonzero(has)
-                self.time_ps = self.time_ps[has]
-                self.notes += (f"{(~has).sum()} frames hold no positions and are left out.",)
-        self.n_frames = len(self.time_ps)
-        if not self.n_frames:
-            raise InputError(f"{self.path} holds no positions.")
-
-    def _stored(self, start: int, stop: int) -> list[Any]:
-        """Return what MDTraj reads of frames `start:stop`, positions first; frames without positions do not count."""
-        kept = None if self._kept is None else self._kept[start:stop]
-        first, last = (start, stop) if kept is None else (int(kept[0]), int(kept[-1]) + 1)
-        try:
-            self._file.seek(first)
-            stored = self._file.read(n_frames=last - first)
-        except Exception as error:
-            reason = first_line(error)
-            raise TrajectoryError(f"{self.path} is damaged in frames {start} to {stop} ({reason}).") from error
-        return [x if kept is None or x is None else np.asarray(x)[kept - first] for x in stored]
-
-    def _read(self, start: int, stop: int, stride: int) -> Float32Array:
-        if self._whole is not None:
-            return np.asarray(self._whole.xyz[start:stop:stride], dtype=np.float32).copy()
-        parts = []
-        block = max(_PASS_FRAMES // stride, 1) * stride
-        for first in range(start, stop, block):
-            positions = self._stored(first, min(first + block, stop))[0][::stride]
-            parts.append(np.asarray(positions, dtype=np.float32) * np.float32(self._nm))
-        return np.concatenate(parts)
-
-    def _read_cells(self, start: int, stop: int, stride: int) -> Float64Array | None:
-        if self._whole is not None:
-            cells = self._whole.unitcell_vectors
-            return None if cells is None else np.asarray(cells[start:stop:stride], dtype=np.float64)
-        if start >= stop:
-            return np.empty((0, 3, 3))
-        stored = self._stored(start, stop)
-        if self._format.name.startswith("NetCDF"):  # lengths and angles
-            if stored[2] is None:
-                return None
-            return read_cells(np.asarray(stored[2])[::stride] * self._cell_nm, np.asarray(stored[3])[::stride])
-        if self._format.name == "TRR" and not trr_has_cell(self.path):
-            return None
-        cells = None if stored[3] is None else np.asarray(stored[3], dtype=np.float64)
-        return cells[::stride] if cells is not None and cells.ndim == 3 and cells.any() else None
-
-    def close(self) -> None:
-        super().close()
-        if self._file is not None:
-            self._file.close()
-        self._file = None
-        self._ascii.close()
+    with TRRFile(str(path)) as frames:
+        has = np.array([frame.hasx for frame in frames], dtype=bool)
+    with path.open("rb") as file:
+        length = int.from_bytes(file.read(12)[8:], "big")
+        file.seek(-(-length // 4) * 4 + 8, 1)
+        return has, int.from_bytes(file.read(4), "big") > 0
 
 
 class MdanalysisReader(TrajectoryReader):
@@ -420,25 +300,20 @@ class MdanalysisReader(TrajectoryReader):
         try:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")
-                kind = get_reader_for(str(path), format=self._format.mda)
                 size = {} if stated is None else {"n_atoms": stated.n_atoms}
+                kind = get_reader_for(str(path), format=self._format.mda)
                 self._reader: Any = kind(str(path), convert_units=True, **size)
                 self.n_frames, self.n_atoms = int(self._reader.n_frames), int(self._reader.n_atoms)
                 self.time_ps, self.times_known = self._times()
         except InputError:
             raise
-        except (ValueError, TypeError) as error:
+        except Exception as error:  # each of its readers raises errors of its own
             # Of a format that it does not know it lists all others in the lines that follow.
             why = first_line(error).partition(". The FORMATs")[0]
             raise TrajectoryError(
                 f"{path} cannot be read by MDTraj or MDAnalysis {MDAnalysis.__version__}: {why}."
             ) from error
-        except Exception as error:  # each of its readers raises its own kinds
-            raise TrajectoryError(f"{path} cannot be read: {first_line(error)}.") from error
-        if stated is not None and stated.n_atoms != self.n_atoms:
-            self.close()
-            raise InputError(f"{top} has {stated.n_atoms} atoms, {path} has {self.n_atoms}; give the matching one.")
-        self.scene = None if stated is None else self._at_first_frame(stated)
+        self._take_scene(stated, top)
 
     def _times(self) -> tuple[Float64Array, bool]:
         """Return times `(n_frames,)` ps and whether the file states them; frames without positions are left out.
@@ -476,103 +351,10 @@ class MdanalysisReader(TrajectoryReader):
 
     def close(self) -> None:
         super().close()
-        if self._reader is not None:
-            self._reader.close()
-        self._reader = None
+        self._reader.close()
 
 
-# ---- H5MD of other programs -----------------------------------------------------------------------------------------
-
-
-class H5mdReader(TrajectoryReader):
-    """Reads the positions of an H5MD file's particles. Times without a unit are not known.
-
-    Raises TrajectoryError for a file that is damaged or states no unit of length, InputError for several groups of
-    particles or a `top` that does not fit.
-    """
-
-    def __init__(self, path: Path, top: Path | None) -> None:
-        super().__init__(path)
-        self._file = open_hdf5(path)
-        try:
-            with damage_reported(path):
-                self._read_headers()
-            stated = self._scene_of(top)
-            self.scene = None if stated is None else self._at_first_frame(stated)
-        except BaseException:
-            self._file.close()
-            raise
-
-    def _read_headers(self) -> None:
-        groups = [g for g in self._file.get("particles", {}).values() if "position/value" in g]
-        if not groups:
-            raise InputError(f"{self.path} holds no positions of particles.")
-        if len(groups) > 1:
-            names = ", ".join(g.name.rpartition("/")[2] for g in groups)
-            raise InputError(f"{self.path} holds several groups of particles ({names}); write one of them alone.")
-        self._box, position = groups[0].get("box"), groups[0]["position"]
-        self._value = position["value"]
-        if self._value.ndim != 3 or self._value.shape[2] != 3:
-            raise TrajectoryError(f"{self.path}: positions of shape {self._value.shape}, not (n, n_atoms, 3).")
-        self.n_frames, self.n_atoms = self._value.shape[:2]
-        nm = nm_per(self._value.attrs.get("unit", ""))
-        if nm is None:
-            raise TrajectoryError(
-                f"{self.path}: its positions state no unit of length that is known; set the attribute `unit` of "
-                f"{self._value.name} to 'nm' or 'Angstrom'."
-            )
-        self._nm = nm
-        self.time_ps, self.times_known = np.arange(self.n_frames, dtype=np.float64), False
-        time = position.get("time")
-        ps = None if time is None else ps_per(time.attrs.get("unit", ""))
-        if time is not None and ps is None:
-            self.notes = ("its times state no unit that is known and are not used.",)
-        elif time is not None and ps is not None:
-            steps: Any = time[()]
-            if np.ndim(steps) == 0:
-                steps = float(time.attrs.get("offset", 0.0)) + steps * np.arange(self.n_frames)
-            self.time_ps, self.times_known = ps * np.asarray(steps[: self.n_frames], dtype=np.float64), True
-            if len(self.time_ps) != self.n_frames:
-                raise TrajectoryError(f"{self.path} is damaged: {self.n_frames} frames, {len(self.time_ps)} times.")
-
-    def _read(self, start: int, stop: int, stride: int) -> Float32Array:
-        return self._rows(self._value, start, stop, stride).astype(np.float32) * np.float32(self._nm)
-
-    def _read_cells(self, start: int, stop: int, stride: int) -> Float64Array | None:
-        with damage_reported(self.path):
-            edges = None if self._box is None else self._box.get("edges", self._box.attrs.get("edges"))
-            if edges is None:
-                return None
-            column = edges.get("value") if isinstance(edges, h5py.Group) else None
-            if column is not None:
-                values, unit = self._rows(column, start, stop, stride), column.attrs.get("unit")
-            else:
-                one: npt.NDArray[Any] = np.asarray(edges[()])
-                values = np.broadcast_to(one, (len(range(start, stop, stride)), *one.shape))
-                unit = edges.attrs.get("unit") if isinstance(edges, h5py.Dataset) else None
-            nm = self._nm if unit is None else nm_per(unit)
-            if nm is None:
-                raise TrajectoryError(
-                    f"{self.path}: its cell is in {unit!r}, a unit that is not known; write it in nm."
-                )
-            cells = values[..., None] * np.eye(3) if values.ndim == 2 else values
-            return None if not np.any(cells) else np.asarray(cells, dtype=np.float64) * nm
-
-    def _rows(self, column: h5py.Dataset, start: int, stop: int, stride: int) -> npt.NDArray[Any]:
-        try:
-            rows: npt.NDArray[Any] = np.asarray(column[start:stop])[::stride]
-        except UNREADABLE as error:
-            raise TrajectoryError(
-                f"{self.path} is damaged in frames {start} to {stop} ({first_line(error)})."
-            ) from error
-        return rows
-
-    def close(self) -> None:
-        super().close()
-        self._file.close()
-
-
-# ---- XYZ ------------------------------------------------------------------------------------------------------------
+# ---- XYZ and ASE ----------------------------------------------------------------------------------------------------
 
 
 _FIELD = re.compile(r'(\w+)\s*=\s*(?:"([^"]*)"|\'([^\']*)\'|(\S+))')
@@ -585,56 +367,67 @@ class _Frame(NamedTuple):
     cell_nm: Float64Array | None
 
 
-class XyzReader(TrajectoryReader):
-    """Reads an XYZ file whole into memory; names or elements are the file's, bonds found by distance.
+class AtomsReader(_InMemory):
+    """Reads an XYZ file, or one of ASE's `Trajectory`, whole into memory; names or elements are the file's, bonds found
+    by distance.
 
-    Frames whose atoms stand in another order are put into the first one's where names tell it. Raises TrajectoryError
-    for a damaged file or one of changing atoms, InputError for a `top` that does not fit.
+    Raises TrajectoryError for a damaged file, one of changing atoms, or where ase is not installed; InputError for a
+    `top` that does not fit.
     """
 
     def __init__(self, path: Path, top: Path | None) -> None:
         super().__init__(path)
-        frames, moved = _frames(path)
+        is_ase = path.suffix.lower() == ".traj"
+        frames = _ase_frames(path) if is_ase else _xyz_frames(path)
         if not frames:
             raise TrajectoryError(f"{path} holds no frame.")
         first, self.n_frames, self.n_atoms = frames[0], len(frames), len(frames[0].names)
+        for k, frame in enumerate(frames):
+            check_same_atoms(frame.names, first.names, path, k)
         self.time_ps, self.times_known = np.arange(self.n_frames, dtype=np.float64), False
-        self.notes = moved
         self._positions = np.stack([f.positions_nm for f in frames])
         cells = [f.cell_nm for f in frames if f.cell_nm is not None]
         self._cells = np.stack(cells) if len(cells) == self.n_frames else None
         stated = self._scene_of(top)
         if stated is None:
-            self.scene = named_scene(path, first.names, _elements(first.names, path), first.positions_nm, first.cell_nm)
-        else:
-            self.scene = self._at_first_frame(stated)
-
-    def _read(self, start: int, stop: int, stride: int) -> Float32Array:
-        return self._positions[start:stop:stride].copy()
-
-    def _read_cells(self, start: int, stop: int, stride: int) -> Float64Array | None:
-        return None if self._cells is None else self._cells[start:stop:stride].copy()
+            names = [f"{e}{k + 1}" for k, e in enumerate(first.names)] if is_ase else first.names
+            stated = named_scene(path, names, _elements(first.names, path), first.positions_nm, first.cell_nm)
+        self._take_scene(stated, top)
 
 
-def _frames(path: Path) -> tuple[list[_Frame], tuple[str, ...]]:
+def _ase_frames(path: Path) -> list[_Frame]:
+    try:
+        from ase.io.trajectory import Trajectory
+    except ImportError as error:
+        raise TrajectoryError(
+            f"{path} is read by ase: `pip install ase`, or convert it elsewhere by `ase convert {path.name} "
+            f"{path.stem}.xyz`."
+        ) from error
+    try:
+        with Trajectory(str(path)) as file:
+            return [
+                _Frame(
+                    atoms.get_chemical_symbols(),
+                    np.asarray(atoms.positions * _NM, dtype=np.float32),
+                    atoms.cell.array * _NM if atoms.pbc.all() else None,
+                )
+                for atoms in file
+            ]
+    except Exception as error:  # ase raises whatever its parts do
+        raise TrajectoryError(f"{path} cannot be read by ase: {first_line(error)}.") from error
+
+
+def _xyz_frames(path: Path) -> list[_Frame]:
     frames: list[_Frame] = []
-    moved = {}
     try:
         with _open_text(path) as file:
             for count in file:
-                if not count.strip():
-                    continue
-                n, comment = int(count), file.readline()
-                rows = [line.split() for line in itertools.islice(file, n)]
-                frame = _frame(rows, comment, n)
-                order = order_of(frame.names, frames[0].names, path, len(frames)) if frames else None
-                if order is not None:
-                    moved[len(frames)] = order
-                    frame = _Frame(frames[0].names, frame.positions_nm[order], frame.cell_nm)
-                frames.append(frame)
+                if count.strip():
+                    n, comment = int(count), file.readline()
+                    frames.append(_frame([line.split() for line in itertools.islice(file, n)], comment, n))
     except (ValueError, IndexError, OSError, EOFError, zlib.error) as error:
         raise TrajectoryError(f"{path} is damaged or cut short in frame {len(frames)} ({error}).") from error
-    return frames, _moved_note(moved)
+    return frames
 
 
 def _frame(rows: list[list[str]], comment: str, n_atoms: int) -> _Frame:
@@ -675,67 +468,3 @@ def _elements(names: list[str], path: Path) -> list[str]:
             raise InputError(f"{path}: the element of atom {i} ({name}) is not known; give a PDB file with `top`.")
         out.append(element)
     return out
-
-
-# ---- ASE ------------------------------------------------------------------------------------------------------------
-
-
-class AseReader(TrajectoryReader):
-    """A file of ASE's `Trajectory`, read frame by frame; elements are the file's, bonds found by distance.
-
-    Raises TrajectoryError where ase is not installed or cannot read it, InputError for a `top` that does not fit.
-    """
-
-    def __init__(self, path: Path, top: Path | None) -> None:
-        super().__init__(path)
-        try:
-            from ase.io.trajectory import Trajectory
-        except ImportError as error:
-            raise TrajectoryError(
-                f"{path} is read by ase: `pip install ase`, or convert it elsewhere by `ase convert {path.name} "
-                f"{path.stem}.xyz`."
-            ) from error
-        try:
-            self._frames: Any = Trajectory(str(path))
-            self.n_frames = len(self._frames)
-            first = self._frames[0]
-        except Exception as error:  # ase raises whatever its parts do
-            raise TrajectoryError(f"{path} cannot be read by ase: {first_line(error)}.") from error
-        self.n_atoms = len(first)
-        self.time_ps, self.times_known = np.arange(self.n_frames, dtype=np.float64), False
-        self._elements = [str(x) for x in first.get_chemical_symbols()]
-        try:
-            stated = self._scene_of(top)
-        except InputError:
-            self.close()
-            raise
-        if stated is None:
-            cell = first.cell.array * _NM if first.pbc.all() else None
-            names = [f"{e}{k + 1}" for k, e in enumerate(self._elements)]
-            stated = named_scene(path, names, self._elements, first.positions * _NM, cell)
-        self.scene = self._at_first_frame(stated)
-
-    def _read(self, start: int, stop: int, stride: int) -> Float32Array:
-        out = np.empty((len(range(start, stop, stride)), self.n_atoms, 3), dtype=np.float32)
-        for k, frame in enumerate(self._stored(start, stop, stride)):
-            order_of(list(frame.get_chemical_symbols()), self._elements, self.path, start + k * stride)
-            out[k] = frame.positions * _NM
-        return out
-
-    def _read_cells(self, start: int, stop: int, stride: int) -> Float64Array | None:
-        frames = self._stored(start, stop, stride)
-        if not all(frame.pbc.all() for frame in frames):
-            return None
-        return np.array([frame.cell.array * _NM for frame in frames], dtype=np.float64).reshape(-1, 3, 3)
-
-    def _stored(self, start: int, stop: int, stride: int) -> list[Any]:
-        try:
-            return [self._frames[k] for k in range(start, stop, stride)]
-        except Exception as error:  # ase raises whatever its parts do
-            raise TrajectoryError(
-                f"{self.path} is damaged in frames {start} to {stop} ({first_line(error)})."
-            ) from error
-
-    def close(self) -> None:
-        super().close()
-        self._frames.close()

@@ -20,9 +20,8 @@ from systems.chemistry.bond_orders import ValenceError, perceive
 from systems.chemistry.distance_bonds import with_bonds_by_distance
 from systems.chemistry.element_data import atomic_weight_da, element_symbol
 from systems.errors import InputError, TrajectoryError, first_line
-from systems.files.schema import parsed
 from systems.prepare.structure_text import read_structure
-from systems.scene import Scene
+from systems.scene import IntArray, Scene
 
 _NM = {"nanometer": 1.0, "nm": 1.0, "angstrom": 0.1, "a": 0.1, "å": 0.1, "bohr": 0.0529177210903, "pm": 1e-3}
 _PS = {"picosecond": 1.0, "ps": 1.0, "femtosecond": 1e-3, "fs": 1e-3, "nanosecond": 1e3, "ns": 1e3, "microsecond": 1e6,
@@ -30,12 +29,12 @@ _PS = {"picosecond": 1.0, "ps": 1.0, "femtosecond": 1e-3, "fs": 1e-3, "nanosecon
 
 
 def nm_per(unit: Any) -> float | None:
-    """Return the unit of length in nm, None of one that is not known."""
+    """Return the unit of length in nm, None for an unknown one."""
     return _NM.get(_name(unit))
 
 
 def ps_per(unit: Any) -> float | None:
-    """Return the unit of time in ps, None of one that is not known."""
+    """Return the unit of time in ps, None for an unknown one."""
     return _PS.get(_name(unit))
 
 
@@ -54,9 +53,9 @@ EVERY, SOME, NONE = "stated", "where stated", "no"
 class Format:
     """One format, as the manual's table has it (docs/files.md), which also says what its library makes up.
 
-    `times`, `positions`: EVERY, SOME or NONE, as files state them. `names_atoms`: whether it needs no `top`.
-    `unit_taken`: the unit that is taken, with a line, where nothing states one. `streamed`: read block by block. `mda`:
-    MDAnalysis' name of it, where the suffix does not say.
+    `times`: EVERY, SOME or NONE, as files state them. `names_atoms`: whether it needs no `top`.
+    `unit_taken`: the unit that is taken, with a line, where nothing states one. `mda`: MDAnalysis' name of it, where
+    the suffix does not say.
     """
 
     name: str
@@ -64,9 +63,7 @@ class Format:
     reader: str
     times: str
     names_atoms: bool
-    positions: str = EVERY
     unit_taken: str = ""
-    streamed: bool = False
     mda: str | None = None
 
 
@@ -76,9 +73,9 @@ FORMATS = (
     Format("DCD", (".dcd",), "surromd", SOME, False),
     Format("XYZ, extended XYZ", XYZ_SUFFIXES, "surromd", NONE, True),
     Format("ASE", (".traj",), "ase", NONE, True),
-    Format("XTC", (".xtc",), "MDTraj", EVERY, False, streamed=True),
-    Format("TRR", (".trr",), "MDTraj", EVERY, False, positions=SOME, streamed=True),
-    Format("NetCDF (Amber)", (".nc", ".ncdf", ".netcdf"), "MDTraj", SOME, False, streamed=True),
+    Format("XTC", (".xtc",), "MDTraj", EVERY, False),
+    Format("TRR", (".trr",), "MDTraj", EVERY, False),
+    Format("NetCDF (Amber)", (".nc", ".ncdf", ".netcdf"), "MDTraj", SOME, False),
     Format("PDB", (".pdb", ".pdb.gz"), "MDTraj", NONE, True),
     Format("PDBx/mmCIF", (".pdbx", ".cif", ".mmcif", ".pdbx.gz", ".cif.gz", ".mmcif.gz"), "MDTraj", NONE, True),
     Format("GRO", (".gro",), "MDTraj", SOME, True),
@@ -94,7 +91,7 @@ FORMATS = (
     Format("OpenMM XML", (".xml",), "MDTraj", NONE, False),
     Format("H5MD", (".h5md",), "surromd", SOME, False),
     Format("LAMMPS dump", (".lammpsdump", ".dump"), "MDAnalysis", NONE, True, unit_taken="Å", mda="LAMMPSDUMP"),
-    Format("TNG", (".tng",), "MDAnalysis", EVERY, False, positions=SOME),
+    Format("TNG", (".tng",), "MDAnalysis", EVERY, False),
     Format("GROMOS TRC", (".trc",), "MDAnalysis", EVERY, False),
     Format("TRZ", (".trz",), "MDAnalysis", EVERY, False),
     Format("GSD", (".gsd",), "MDAnalysis", NONE, True, unit_taken="Å"),
@@ -168,34 +165,21 @@ def scene_from_mdtraj_topology(
     )
 
 
-def scene_from_topology_json(text: bytes | str, positions_nm: npt.ArrayLike, path: Path) -> Scene:
-    """Return the Scene of an MDTraj HDF5 file's topology JSON. Raises TrajectoryError when it is damaged."""
-    import mdtraj
-    from mdtraj.core import element
-    from mdtraj.core.topology import bond_name_to_type
+def scene_of_mdtraj_hdf5(path: Path, positions_nm: npt.ArrayLike) -> Scene:
+    """Return the Scene of MDTraj's topology in an HDF5 file. Raises TrajectoryError when it is damaged."""
+    from mdtraj.formats import HDF5TrajectoryFile
 
     try:
-        record = parsed(text)
-        topology = mdtraj.Topology()
-        for chain_record in sorted(record["chains"], key=lambda c: c["index"]):
-            chain = topology.add_chain(chain_record.get("chain_id"))
-            for entry in sorted(chain_record["residues"], key=lambda r: r["index"]):
-                residue = topology.add_residue(entry["name"], chain, resSeq=entry.get("resSeq", entry["index"] + 1))
-                for atom in sorted(entry["atoms"], key=lambda a: a["index"]):
-                    symbol = atom["element"]
-                    kind = element.get_by_symbol(symbol) if symbol else element.virtual
-                    topology.add_atom(atom["name"], kind, residue, formal_charge=atom.get("formal_charge"))
-        atoms = list(topology.atoms)
-        metadata = record.get("bond_metadata") or [{"order": None, "type": None}] * len(record["bonds"])
-        for (i, j), bond in zip(record["bonds"], metadata, strict=True):
-            topology.add_bond(atoms[i], atoms[j], order=bond["order"], type=bond_name_to_type(bond["type"]))
-    except (KeyError, ValueError, TypeError, IndexError) as error:
+        with warnings.catch_warnings(), HDF5TrajectoryFile(str(path)) as file:
+            warnings.simplefilter("ignore")  # a topology may number no residues
+            topology = file.topology
+    except Exception as error:  # PyTables and MDTraj raise errors of their own
         raise TrajectoryError(f"{path} is damaged: its /topology cannot be understood ({error}).") from error
     return scene_from_mdtraj_topology(topology, positions_nm, name=path.stem, source=path.name)
 
 
 def scene_from_structure(top: Path, *, name: str) -> Scene:
-    """Return the Scene of a structure or topology file that stands beside a trajectory, by MDTraj or MDAnalysis.
+    """Return the Scene of a structure or topology file given with a trajectory, by MDTraj or MDAnalysis.
 
     Bonds are MDTraj's (its residue templates and CONECT records); atoms that it leaves without one are bonded by their
     distances. Elements of PDB and mmCIF files are read here: where the element column is empty MDTraj takes CA for
@@ -204,21 +188,28 @@ def scene_from_structure(top: Path, *, name: str) -> Scene:
     """
     import mdtraj
 
-    if not is_mdtraj_format(top) or top.suffix.lower() in (".xyz", ".gsd"):
-        if top.suffix.lower() in (".psf", ".prmtop", ".parm7", ".top"):
+    suffix = top.suffix.lower()
+    if top.name.lower().endswith(XYZ_SUFFIXES):
+        from systems.trajectory.foreign_readers import AtomsReader
+
+        made = AtomsReader(top, None).scene
+        assert made is not None
+        return replace(made, name=name)
+    if format_of(top).reader != "MDTraj" and suffix not in (".h5", ".hdf5"):
+        if suffix in (".psf", ".prmtop", ".parm7", ".top"):
             with contextlib.suppress(Exception):  # MDAnalysis is asked next, and says what is wrong
                 bare = mdtraj.load_topology(str(top))
                 return scene_from_mdtraj_topology(bare, np.zeros((bare.n_atoms, 3)), name=name, source=top.name)
         return scene_from_universe(top, name=name)
     try:
         structure = mdtraj.load(str(top))
-    except Exception as error:  # each MDTraj reader raises its own kinds
+    except Exception as error:  # each MDTraj reader raises errors of its own
         raise InputError(f"{top} cannot be read as a structure: {first_line(error)}.") from error
     topology = structure.topology
     elements = None
     with contextlib.suppress(InputError):
         records = read_structure(top).atoms
-        # MDTraj renames atoms, so that only positions tell whether both readers kept the same ones.
+        # MDTraj renames atoms, so only positions show whether both readers kept the same ones.
         read_nm = np.array([r.position_angstrom for r in records]) / 10.0
         if read_nm.shape == structure.xyz[0].shape and np.allclose(read_nm, structure.xyz[0], atol=1e-4):
             elements = [r.element for r in records]
@@ -227,19 +218,19 @@ def scene_from_structure(top: Path, *, name: str) -> Scene:
 
 
 def scene_from_universe(top: Path, *, name: str) -> Scene:
-    """Return the Scene of a topology that MDAnalysis reads (TPR, GSD, XYZ, LAMMPS data, ...).
+    """Return the Scene of a topology that MDAnalysis reads (TPR, GSD, LAMMPS data, ...).
 
     Bonds are the file's, or by covalent radii where it holds none; positions are zero where it holds none. Raises
     InputError when it cannot be read, or an element is not known.
     """
     import MDAnalysis
 
-    format_ = "XYZ" if top.suffix.lower() == ".extxyz" else format_of(top).mda
+    format_ = format_of(top).mda
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             universe = MDAnalysis.Universe(str(top), **({} if format_ is None else {"topology_format": format_}))
-    except Exception as error:  # each of its parsers raises its own kinds
+    except Exception as error:  # each of its parsers raises errors of its own
         raise InputError(f"{top} cannot be read as a topology: {first_line(error)}.") from error
     atoms = universe.atoms
     has_positions = hasattr(universe, "trajectory") and universe.trajectory.n_frames > 0
@@ -253,40 +244,17 @@ def scene_from_universe(top: Path, *, name: str) -> Scene:
     written = [str(x) for x in _values(atoms, "elements", [""] * len(atoms))]
     elements = []
     for i, (atom, element) in enumerate(zip(names, written, strict=True)):
-        # XYZ files hold symbols or PDB names: CA in capitals is an alpha carbon, which MDAnalysis takes for calcium.
-        guessed = "xyz" in top.suffix.lower() and len(element) == 2 and atom.isupper() and atom not in ("CL", "BR")
-        symbol = element_symbol(atom, residues[of_atom[i]], "" if guessed else element)
+        symbol = element_symbol(atom, residues[of_atom[i]], element)
         if symbol is None:
             raise InputError(f"{top}: the element of atom {i} ({atom}) is not known; give a PDB file with `top`.")
         elements.append(symbol)
     bonds = np.empty((0, 2), dtype=np.int64)
     if hasattr(atoms, "bonds"):
         bonds = np.unique(np.sort(np.asarray(atoms.bonds.to_indices()).reshape(-1, 2), axis=1), axis=0).astype(np.int64)
-    scene = Scene(
-        name=name,
-        atom_names=tuple(names),
-        elements=tuple(elements),
-        residue_of_atom=of_atom,
-        residue_names=tuple(residues),
-        residue_ids=tuple(str(x) for x in _values(atoms.residues, "resids", range(1, len(residues) + 1))),
-        chain_of_residue=("A",) * len(residues),
-        bonds=bonds,
-        bond_orders=np.zeros(len(bonds)),
-        formal_charges=np.zeros(len(elements), dtype=np.int64),
-        masses_da=np.array([atomic_weight_da(e) for e in elements]),
-        positions_nm=positions,
-        provenance={"source": top.name},
-    )
-    return with_orders(with_bonds_by_distance(scene))
-
-
-def is_mdtraj_format(path: Path) -> bool:
-    """Whether MDTraj has a reader for files of this suffix that needs no topology of the caller's beyond `top`."""
-    from mdtraj.formats.registry import FormatRegistry
-
-    if format_of(path) is not OTHER:
-        return format_of(path).reader in ("MDTraj", "surromd")
-    return any(path.name.lower().endswith(s) for s in FormatRegistry.loaders)
+    ids = [str(x) for x in _values(atoms.residues, "resids", range(1, len(residues) + 1))]
+    scene = named_scene(top, names, elements, positions, residue_of_atom=of_atom, residue_names=residues,
+                        residue_ids=ids, bonds=bonds)  # fmt: skip
+    return replace(scene, name=name)
 
 
 def named_scene(
@@ -294,21 +262,26 @@ def named_scene(
     names: Sequence[str],
     elements: Sequence[str],
     positions_nm: npt.ArrayLike,
-    cell_nm: npt.ArrayLike | None,
+    cell_nm: npt.ArrayLike | None = None,
+    *,
+    residue_of_atom: IntArray | None = None,
+    residue_names: Sequence[str] = ("MOL",),
+    residue_ids: Sequence[str] = ("1",),
+    bonds: IntArray | None = None,
 ) -> Scene:
-    """Return the Scene of atoms that a file only names, one residue; bonds by distance, across the cell `(3, 3)` nm
-    too, orders by valence."""
-    n = len(elements)
+    """Return the Scene of atoms that a file only names, one chain; bonds by distance where it states none, across the
+    cell `(3, 3)` nm too, orders by valence."""
+    n, rows = len(elements), np.empty((0, 2), dtype=np.int64) if bonds is None else bonds
     scene = Scene(
         name=path.stem,
         atom_names=tuple(names),
         elements=tuple(elements),
-        residue_of_atom=np.zeros(n, dtype=np.int64),
-        residue_names=("MOL",),
-        residue_ids=("1",),
-        chain_of_residue=("A",),
-        bonds=np.empty((0, 2), dtype=np.int64),
-        bond_orders=np.zeros(0),
+        residue_of_atom=np.zeros(n, dtype=np.int64) if residue_of_atom is None else residue_of_atom,
+        residue_names=tuple(residue_names),
+        residue_ids=tuple(residue_ids),
+        chain_of_residue=("A",) * len(residue_names),
+        bonds=rows,
+        bond_orders=np.zeros(len(rows)),
         formal_charges=np.zeros(n, dtype=np.int64),
         masses_da=np.array([atomic_weight_da(e) for e in elements]),
         positions_nm=np.asarray(positions_nm, dtype=np.float64),
@@ -331,7 +304,7 @@ def bonds_completed(scene: Scene, cells_nm: npt.NDArray[np.float64] | None) -> S
 
 
 def with_orders(scene: Scene) -> Scene:
-    """Return the scene with bond orders and charges by valence, unchanged where they cannot be told."""
+    """Return the scene with bond orders and charges by valence, unchanged where they cannot be perceived."""
     try:
         orders, charges = perceive(list(scene.elements), scene.bonds)
     except ValenceError:

@@ -11,173 +11,114 @@ kJ/mol/nm.
 
 from __future__ import annotations
 
+import itertools
 import json
+import re
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 import h5py
 import numpy as np
-import numpy.typing as npt
 
-from systems.chemistry.distance_bonds import lengths_and_angles
-from systems.chemistry.distance_bonds import read_cells as cells_of
-from systems.errors import InputError, TrajectoryError, first_line
-from systems.files.outside import UNREADABLE
-from systems.files.whole_file import refuse_existing
+from systems.chemistry.distance_bonds import lengths_and_angles, read_cells
+from systems.errors import InputError, TrajectoryError
 from systems.scene import ATOMIC_NUMBERS, Scene
-from systems.trajectory.base import (
-    CELLS,
-    EDGES,
-    FRAMES,
-    Float32Array,
-    Float64Array,
-    FrameBlock,
-    TrajectoryReader,
-    TrajectoryWriter,
-    add_column,
-    create_store,
-    damage_reported,
-    open_hdf5,
-    program_version,
-    unused_top_note,
-)
-from systems.trajectory.companion_writer import refuse_other_topology, topology_bytes, topology_path, write_topology
+from systems.trajectory.base import TrajectoryReader, TrajectoryWriter
 from systems.trajectory.foreign_readers import counted_note
 from systems.trajectory.foreign_scenes import (
     bonds_completed,
     nm_per,
     ps_per,
     scene_from_structure,
-    scene_from_topology_json,
+    scene_of_mdtraj_hdf5,
+)
+from systems.trajectory.store import (
+    CELLS,
+    EDGES,
+    FRAMES,
+    Columns,
+    Float32Array,
+    Float64Array,
+    FrameBlock,
+    add_column,
+    damage_reported,
+    open_hdf5,
+    program_version,
+    read_rows,
 )
 
-PER_ATOM = ("velocities", "forces")
-# Dataset: H5MD's name, MDTraj's units, H5MD's unit.
-_LAYOUT = {
-    "velocities": ("velocity", b"nanometers/picosecond", "nm ps-1"),
-    "forces": ("force", b"kilojoules_per_mole/nanometer", "kJ mol-1 nm-1"),
+# Of each column its units by MDTraj, its unit by H5MD, and H5MD's name beside `position`.
+_UNITS = {
+    "coordinates": (b"nanometers", "nm", ""),
+    "time": (b"picoseconds", "ps", ""),
+    "velocities": (b"nanometers/picosecond", "nm ps-1", "velocity"),
+    "forces": (b"kilojoules_per_mole/nanometer", "kJ mol-1 nm-1", "force"),
+    "cell_lengths": (b"nanometers", "nm", ""),
+    "cell_angles": (b"degrees", "deg", ""),
 }
 _POSITION = "particles/trajectory/position"
-
-
-def lay_out_extras(file: h5py.File, wanted: Sequence[str], *, periodic: bool) -> None:
-    """Add empty columns for what is `wanted`, and for the cell; positions must be there already."""
-    particles, position, coordinates = file["particles/trajectory"], file[_POSITION], file["coordinates"]
-    for name in (n for n in PER_ATOM if n in wanted):
-        h5md_name, units, unit = _LAYOUT[name]
-        column = add_column(file, name, 0, "<f4", tail=coordinates.shape[1:], chunk=coordinates.chunks[0])
-        column.attrs["units"], column.attrs["unit"] = np.bytes_(units), unit
-        group = particles.create_group(h5md_name)
-        group["value"], group["time"], group["step"] = column, position["time"], position["step"]
-    box = particles["box"]
-    box.attrs["boundary"] = np.array([b"periodic" if periodic else b"none"] * 3, dtype="S8")
-    if not periodic:
-        return
-    for name, units, unit in (("cell_lengths", b"nanometers", "nm"), ("cell_angles", b"degrees", "deg")):
-        column = add_column(file, name, 0, "<f4", tail=(3,))
-        column.attrs["units"], column.attrs["unit"] = np.bytes_(units), unit
-    edges = add_column(file, EDGES, 0, "<f8", tail=(3, 3))
-    edges.attrs["unit"] = "nm"
-    box["edges/time"], box["edges/step"] = position["time"], position["step"]
-
-
-def extra_values(
-    file: h5py.File, block: FrameBlock, cell_nm: npt.ArrayLike | None, where: str
-) -> dict[str, npt.NDArray[Any]]:
-    """Return the values of a block by dataset name.
-
-    `cell_nm` (3, 3): the cell of frames that come without one. Raises InputError when velocities or forces are
-    given for some frames of a file and not for others.
-    """
-    values: dict[str, npt.NDArray[Any]] = {}
-    for name, given in (("velocities", block.velocities_nm_ps), ("forces", block.forces_kj_mol_nm)):
-        if (given is not None) != (name in file):
-            state = "holds" if name in file else "was started without"
-            raise InputError(f"{where}: this file {state} {name}; give them with every frame or with none.")
-        if given is not None:
-            values[name] = given
-    if EDGES in file:
-        cell = block.cell_nm
-        if cell is None:
-            cell = np.broadcast_to(np.asarray(cell_nm, dtype=np.float64), (len(block), 3, 3))
-        values["cell_lengths"], values["cell_angles"] = lengths_and_angles(cell)
-        values[EDGES] = np.asarray(cell)
-    elif block.cell_nm is not None:
-        raise InputError(f"{where}: this file has no periodic cell, but frames came with one.")
-    return values
-
-
-def read_cells(file: h5py.File, start: int, stop: int, stride: int) -> npt.NDArray[np.float64] | None:
-    """Return the box vectors `(n, 3, 3)` nm of frames, None in a file that is not periodic. MDTraj's files too."""
-    frames = slice(start, stop, stride)
-    if EDGES in file:
-        cells: npt.NDArray[np.float64] = np.asarray(file[EDGES][frames], dtype=np.float64)
-        return cells
-    if "cell_lengths" in file and "cell_angles" in file:
-        return cells_of(file["cell_lengths"][frames], file["cell_angles"][frames])
-    return None
-
-
-# ---- ours and MDTraj's ----------------------------------------------------------------------------------------------
-
-
 _CHUNK_BYTES = 131_072
-_STRIDED_READ_FRAMES = 8192
 _BOND_TYPES = {1.0: "Single", 1.5: "Aromatic", 2.0: "Double", 3.0: "Triple"}
 
 
 class Hdf5Writer(TrajectoryWriter):
     """Writes one HDF5 trajectory; see `systems.trajectory.codec.open_writer` for the arguments and errors."""
 
-    def __init__(
-        self,
-        path: Path,
-        scene: Scene,
-        record: dict[str, Any],
-        *,
-        append: bool,
-        overwrite: bool,
-        columns: Sequence[str] = (),
-        run_id: str = "",
-    ) -> None:
-        topology = b"" if append and topology_path(path).exists() else topology_bytes(scene)
-        if not append:
-            refuse_existing(path, overwrite)
-            refuse_other_topology(path, topology, overwrite=overwrite)
-            names = (FRAMES, *columns, *([] if scene.cell_nm is None else [CELLS]))
-            create_store(
-                path,
-                scene,
-                record,
-                lambda file: _lay_out(file, scene, columns),
-                overwrite=overwrite,
-                run_id=run_id,
-                checksums=names,
-            )
-        super().__init__(path, path, scene, record, append=append)
-        try:
-            write_topology(path, topology)
-        except BaseException:
-            self.close()
-            raise
+    def _lay_out(self, file: h5py.File, scene: Scene, columns: Sequence[str]) -> None:
+        # MDTraj's and H5MD's groups, empty columns and units.
+        version = program_version()
+        about = {"conventions": "Pande", "conventionVersion": "1.1", "program": "surromd", "title": scene.name,
+                 "programVersion": version, "application": "surromd"}  # fmt: skip
+        for key, value in about.items():
+            file.attrs[key] = np.bytes_(value.encode("ascii", "replace"))
+        frame_bytes = 12 * max(scene.n_atoms, 1)
+        chunk = min(max(_CHUNK_BYTES // frame_bytes, 1), 1024)
+        periodic = scene.cell_nm is not None
+        for name in ("coordinates", *columns):
+            add_column(file, name, 0, "<f4", tail=(scene.n_atoms, 3), chunk=chunk)
+        add_column(file, "time", 0, "<f8")
+        for name in ("cell_lengths", "cell_angles") if periodic else ():
+            add_column(file, name, 0, "<f4", tail=(3,))
+        for name, (units, unit, _) in _UNITS.items():
+            if name in file:
+                file[name].attrs["units"], file[name].attrs["unit"] = np.bytes_(units), unit
+        file.create_dataset("topology", data=np.array([_topology_json(scene).encode("ascii")]))
+
+        h5md = file.create_group("h5md")
+        h5md.attrs["version"] = np.array([1, 1], dtype=np.int32)
+        h5md.create_group("author").attrs["name"] = "surromd"
+        creator = h5md.create_group("creator")
+        creator.attrs["name"], creator.attrs["version"] = "surromd", version
+        particles = file.create_group("particles/trajectory")
+        box = particles.create_group("box")
+        box.attrs["dimension"] = np.int32(3)
+        box.attrs["boundary"] = np.array([b"periodic" if periodic else b"none"] * 3, dtype="S8")
+        add_column(file, f"{_POSITION}/step", 0, "<i8")
+        position = particles["position"]
+        position["value"], position["time"] = file["coordinates"], file["time"]
+        for name in columns:
+            group = particles.create_group(_UNITS[name][2])
+            group["value"], group["time"], group["step"] = file[name], file["time"], position["step"]
+        if periodic:
+            add_column(file, EDGES, 0, "<f8", tail=(3, 3)).attrs["unit"] = "nm"
+            box["edges/time"], box["edges/step"] = file["time"], position["step"]
+        particles["species"] = np.array([ATOMIC_NUMBERS.get(e, 0) for e in scene.elements], dtype=np.int32)
+        particles["mass"] = scene.masses_da
+        particles["mass"].attrs["unit"] = "u"
 
     def _adopt(self) -> None:
         if "coordinates" not in self.file:
             raise TrajectoryError(f"{self.path} holds no coordinates; it is the companion of a DCD file.")
 
     def _append(self, block: FrameBlock) -> None:
-        timestep_ps = self.record.get("timestep_ps")
-        if isinstance(timestep_ps, int | float) and timestep_ps > 0:
-            step = np.rint(block.time_ps / timestep_ps).astype(np.int64)
-        else:
-            step = np.arange(self.n_frames, self.n_frames + len(block), dtype=np.int64)
-        with self._open():
-            extra = extra_values(self.file, block, self.scene.cell_nm, f"{self.path}, after frame {self.n_frames}")
-        stored = {FRAMES: block.positions_nm, **{name: extra[name] for name in PER_ATOM if name in extra}}
-        if EDGES in extra:
-            stored[CELLS] = extra[EDGES]
-        self._store(block, {"coordinates": block.positions_nm, f"{_POSITION}/step": step, **extra}, stored)
+        columns: Columns = {"coordinates": block.positions_nm, **block.per_atom}
+        columns[f"{_POSITION}/step"] = self._steps(block.time_ps, np.int64)
+        stored: Columns = {FRAMES: block.positions_nm, **block.per_atom}
+        if block.cell_nm is not None:
+            columns["cell_lengths"], columns["cell_angles"] = lengths_and_angles(block.cell_nm)
+            columns[EDGES] = stored[CELLS] = block.cell_nm
+        self._store(block, columns, stored)
 
 
 class Hdf5Reader(TrajectoryReader):
@@ -185,6 +126,9 @@ class Hdf5Reader(TrajectoryReader):
 
     Raises TrajectoryError when the file is damaged or incomplete, InputError when `top` does not fit.
     """
+
+    # Of its unit of length.
+    _nm = 1.0
 
     def __init__(self, path: Path, top: Path | None = None) -> None:
         super().__init__(path)
@@ -200,81 +144,120 @@ class Hdf5Reader(TrajectoryReader):
         if "coordinates" not in self._file:
             raise TrajectoryError(f"{self.path} holds no /coordinates: it is not an MDTraj or surromd trajectory.")
         self._read_stored(self._file, self.path)
-        self._coordinates = self._file["coordinates"]
-        if self._coordinates.ndim != 3 or self._coordinates.shape[2] != 3:
-            raise TrajectoryError(f"{self.path}: /coordinates of shape {self._coordinates.shape}, not (n, n_atoms, 3).")
-        self._scale = _per_unit(self._file, "coordinates", nm_per, self.path)
-        self.n_atoms = int(self._coordinates.shape[1])
+        self._take_coordinates(self._file["coordinates"])
         self._is_ours = "surromd" in self._file
         self.times_known = self._is_ours or "time" in self._file
-        if not self._is_ours and "time" in self._file:
-            self.time_ps = self.time_ps * _per_unit(self._file, "time", ps_per, self.path)
-            self.notes = counted_note(self.time_ps)
-        unused = () if top is None else (unused_top_note(top),)
+        unused = () if top is None else (f"{top} is not used: the file holds its own topology.",)
         if self._is_ours:
-            self.notes += unused
+            self.notes = unused
         else:
-            self.scene = self._foreign_scene(top, unused)
+            self._check_units()
+            self.notes = counted_note(self.time_ps) if self.times_known else ()
+            self._take_foreign_scene(top, unused)
         if self.scene is not None and self.scene.n_atoms != self.n_atoms:
             raise TrajectoryError(f"{self.path}: {self.n_atoms} atoms a frame, but {self.scene.n_atoms} in its scene.")
 
-    def _foreign_scene(self, top: Path | None, unused: tuple[str, ...]) -> Scene | None:
+    def _take_coordinates(self, column: h5py.Dataset) -> None:
+        if column.ndim != 3 or column.shape[2] != 3:
+            raise TrajectoryError(f"{self.path}: {column.name} of shape {column.shape}, not (n, n_atoms, 3).")
+        self._coordinates, self.n_atoms = column, int(column.shape[1])
+
+    def _check_units(self) -> None:
+        """Raise TrajectoryError unless a file of others is in MDTraj's units, where it states any."""
+        for name, per in (("coordinates", nm_per), ("time", ps_per), ("cell_lengths", nm_per)):
+            units = self._file[name].attrs.get("units") if name in self._file else None
+            if units is not None and per(units) != 1.0:
+                shown = units.decode(errors="replace") if isinstance(units, bytes) else units
+                raise TrajectoryError(f"{self.path}: {name} are in {shown!r}; write them in nm and ps.")
+
+    def _take_foreign_scene(self, top: Path | None, unused: tuple[str, ...]) -> None:
         own = None
         if "topology" in self._file and self.n_frames:
-            own = scene_from_topology_json(self._file["topology"][0], self._read(0, 1, 1)[0], self.path)
+            own = scene_of_mdtraj_hdf5(self.path, self._read(0, 1, 1)[0])
         if top is not None and (own is None or not len(own.bonds)):
             stated = scene_from_structure(top, name=self.path.stem)
             if stated.n_atoms != self.n_atoms or (own is not None and stated.elements != own.elements):
                 raise InputError(f"{top} holds other atoms than {self.path} ({self.n_atoms}); give the matching one.")
-            return self._at_first_frame(stated)
-        if own is None:
-            return None
-        self.notes += unused
-        scene = bonds_completed(own, self._read_cells(0, 1, 1))
-        added = len(scene.bonds) - len(own.bonds)
-        if added:
-            self.notes += (f"{added} bonds that its topology lacks were found by distance.",)
-        return scene
+            self.scene = self._at_first_frame(stated)
+        elif own is not None:
+            self.notes += unused
+            self.scene = bonds_completed(own, self._read_cells(0, 1, 1))
+            if added := len(self.scene.bonds) - len(own.bonds):
+                self.notes += (f"{added} bonds that its topology lacks were found by distance.",)
 
     def _read(self, start: int, stop: int, stride: int) -> Float32Array:
-        frames = self._gather(self._coordinates, start, stop, stride)
+        frames = read_rows(self._coordinates, start, stop, stride, self.path)
         self._check_read(FRAMES, frames, slice(start, stop, stride))
-        return frames if self._scale == 1.0 else (frames * np.float32(self._scale))
+        return frames if self._nm == 1.0 else frames * np.float32(self._nm)
 
     def _read_extra(self, name: str, start: int, stop: int, stride: int) -> Float32Array | None:
         if name not in self._file:
             return None
-        values = self._gather(self._file[name], start, stop, stride)
+        values = read_rows(self._file[name], start, stop, stride, self.path)
         self._check_read(name, values, slice(start, stop, stride))
         return values
 
     def _read_cells(self, start: int, stop: int, stride: int) -> Float64Array | None:
+        frames = slice(start, stop, stride)
         with damage_reported(self.path):
-            cells = read_cells(self._file, start, stop, stride)
-            if cells is not None and not self._is_ours and "cell_lengths" in self._file:
-                cells *= _per_unit(self._file, "cell_lengths", nm_per, self.path)
-        if cells is not None:
-            self._check_read(CELLS, cells, slice(start, stop, stride))
-        return cells
-
-    def _gather(self, column: h5py.Dataset, start: int, stop: int, stride: int) -> Float32Array:
-        if start >= stop:
-            return np.empty((0, *column.shape[1:]), dtype=np.float32)
-        try:
-            if stride == 1:
-                return np.asarray(column[start:stop], dtype=np.float32)
-            # HDF5 gathers strided rows one by one; whole blocks, thinned here, are many times faster.
-            block = max(_STRIDED_READ_FRAMES // stride, 1) * stride
-            parts = [column[s : min(s + block, stop)][::stride] for s in range(start, stop, block)]
-            return np.concatenate(parts).astype(np.float32, copy=False)
-        except UNREADABLE as error:
-            raise TrajectoryError(
-                f"{self.path} is damaged in frames {start} to {stop} ({first_line(error)})."
-            ) from error
+            if EDGES in self._file:
+                cells: Float64Array = np.asarray(self._file[EDGES][frames], dtype=np.float64)
+                self._check_read(CELLS, cells, frames)
+                return cells
+            if "cell_lengths" not in self._file or "cell_angles" not in self._file:
+                return None
+            return read_cells(self._file["cell_lengths"][frames], self._file["cell_angles"][frames])
 
     def close(self) -> None:
         super().close()
         self._file.close()
+
+
+class H5mdReader(Hdf5Reader):
+    """Reads the positions of another program's H5MD file. Times that are fixed steps are not used.
+
+    Raises TrajectoryError for a file that is damaged or lacks units, InputError for several groups of particles or a
+    `top` that does not fit.
+    """
+
+    def _read_headers(self, top: Path | None) -> None:
+        groups = [g for g in self._file.get("particles", {}).values() if "position/value" in g]
+        if len(groups) != 1:
+            raise InputError(f"{self.path} holds positions of {len(groups)} groups of particles; write one alone.")
+        self._edges, position = groups[0].get("box/edges"), groups[0]["position"]
+        self._take_coordinates(position["value"])
+        self.n_frames, self._nm = len(self._coordinates), self._per_unit(self._coordinates, nm_per)
+        time = position.get("time")
+        self.times_known = time is not None and time.ndim == 1
+        self.time_ps = np.arange(self.n_frames, dtype=np.float64)
+        if self.times_known:
+            self.time_ps = self._per_unit(time, ps_per) * np.asarray(time[:], dtype=np.float64)
+        if len(self.time_ps) != self.n_frames:
+            raise TrajectoryError(f"{self.path} is damaged: {self.n_frames} frames, {len(self.time_ps)} times.")
+        self._take_scene(self._scene_of(top), top)
+
+    def _per_unit(self, column: h5py.Dataset, per: Callable[[Any], float | None]) -> float:
+        """Return what one of a dataset's unit is in nm or ps."""
+        factor = per(column.attrs.get("unit", ""))
+        if factor is None:
+            raise TrajectoryError(
+                f"{self.path}: {column.name} states no known unit; set its `unit` to 'nm' or 'ps', say."
+            )
+        return factor
+
+    def _read_cells(self, start: int, stop: int, stride: int) -> Float64Array | None:
+        if self._edges is None:
+            return None
+        with damage_reported(self.path):
+            is_fixed = isinstance(self._edges, h5py.Dataset)
+            column = self._edges if is_fixed else self._edges["value"]
+            values = np.asarray(column[()] if is_fixed else column[start:stop:stride], dtype=np.float64)
+            if is_fixed:
+                values = np.broadcast_to(values, (len(range(start, stop, stride)), *values.shape))
+            if values.ndim == 2:  # the edges of a cuboid
+                values = values[..., None] * np.eye(3)
+            nm = self._per_unit(column, nm_per) if "unit" in column.attrs else self._nm
+            return nm * values if values.any() else None
 
 
 def is_plain_h5md(path: Path) -> bool:
@@ -286,72 +269,24 @@ def is_plain_h5md(path: Path) -> bool:
         return False
 
 
-def _per_unit(file: h5py.File, name: str, per: Callable[[Any], float | None], path: Path) -> float:
-    """Return what one of a dataset's `units` is in nm or ps, 1 where it states none (MDTraj's convention)."""
-    units = file[name].attrs.get("units")
-    factor = 1.0 if units is None else per(units)
-    if factor is None:
-        shown = units.decode(errors="replace") if isinstance(units, bytes) else units
-        raise TrajectoryError(f"{path}: {name} are in {shown!r}, a unit that is not known; write it in nm and ps.")
-    return factor
-
-
-def _lay_out(file: h5py.File, scene: Scene, columns: Sequence[str]) -> None:
-    """Add MDTraj's and H5MD's groups, empty columns and units."""
-    version = program_version()
-    for key, value in {"conventions": "Pande", "conventionVersion": "1.1", "program": "surromd", "title": scene.name,
-                       "programVersion": version, "application": "surromd"}.items():  # fmt: skip
-        file.attrs[key] = np.bytes_(value.encode("ascii", "replace"))
-    frame_bytes = 12 * max(scene.n_atoms, 1)
-    chunk = min(max(_CHUNK_BYTES // frame_bytes, 1), 1024)
-    coordinates = add_column(file, "coordinates", 0, "<f4", tail=(scene.n_atoms, 3), chunk=chunk)
-    coordinates.attrs["units"], coordinates.attrs["unit"] = np.bytes_(b"nanometers"), "nm"
-    time = add_column(file, "time", 0, "<f8")
-    time.attrs["units"], time.attrs["unit"] = np.bytes_(b"picoseconds"), "ps"
-    file.create_dataset("topology", data=np.array([_topology_json(scene).encode("ascii")]))
-
-    h5md = file.create_group("h5md")
-    h5md.attrs["version"] = np.array([1, 1], dtype=np.int32)
-    h5md.create_group("author").attrs["name"] = "surromd"
-    creator = h5md.create_group("creator")
-    creator.attrs["name"], creator.attrs["version"] = "surromd", version
-    particles = file.create_group("particles/trajectory")
-    box = particles.create_group("box")
-    box.attrs["dimension"] = np.int32(3)
-    position = particles.create_group("position")
-    position["value"], position["time"] = coordinates, time
-    add_column(file, f"{_POSITION}/step", 0, "<i8")
-    lay_out_extras(file, columns, periodic=scene.cell_nm is not None)
-    particles["species"] = np.array([ATOMIC_NUMBERS.get(e, 0) for e in scene.elements], dtype=np.int32)
-    particles["mass"] = scene.masses_da
-    particles["mass"].attrs["unit"] = "u"
-
-
 def _topology_json(scene: Scene) -> str:
     """Return MDTraj's topology JSON. Runs of atoms become residues, so that the atom order survives any scene."""
+    residue_of = scene.residue_of_atom.tolist()
     chains: list[dict[str, Any]] = []
-    n_residues = 0
-    last_residue = last_chain = None
-    for atom, residue in enumerate(scene.residue_of_atom.tolist()):
-        chain = scene.chain_of_residue[residue]
-        if chain != last_chain:
-            chains.append({"index": len(chains), "chain_id": chain or None, "residues": []})
-            last_chain, last_residue = chain, None
-        if residue != last_residue:
-            digits = "".join(c for c in scene.residue_ids[residue] if c.isdigit() or c == "-")
-            try:
-                number = int(digits)
-            except ValueError:
-                number = residue + 1
-            name = scene.residue_names[residue]
-            chains[-1]["residues"].append(
-                {"index": n_residues, "name": name, "resSeq": number, "segmentID": "", "atoms": []}
-            )
-            n_residues, last_residue = n_residues + 1, residue
-        chains[-1]["residues"][-1]["atoms"].append(
-            {"index": atom, "name": scene.atom_names[atom], "element": scene.elements[atom],
-             "formal_charge": int(scene.formal_charges[atom])}
-        )  # fmt: skip
+    index = itertools.count()
+    for chain, atoms in itertools.groupby(range(scene.n_atoms), lambda atom: scene.chain_of_residue[residue_of[atom]]):
+        residues = []
+        for residue, members in itertools.groupby(atoms, residue_of.__getitem__):
+            digits = re.sub(r"[^0-9-]", "", scene.residue_ids[residue])
+            number = int(digits) if re.fullmatch(r"-?\d+", digits) else residue + 1
+            held = [
+                {"index": atom, "name": scene.atom_names[atom], "element": scene.elements[atom],
+                 "formal_charge": int(scene.formal_charges[atom])}
+                for atom in members
+            ]  # fmt: skip
+            residues.append({"index": next(index), "name": scene.residue_names[residue], "resSeq": number,
+                             "segmentID": "", "atoms": held})  # fmt: skip
+        chains.append({"index": len(chains), "chain_id": chain or None, "residues": residues})
     orders = scene.bond_orders.tolist()
     metadata = [{"order": order or None, "type": _BOND_TYPES.get(order)} for order in orders]
     return json.dumps({"chains": chains, "bonds": scene.bonds.tolist(), "bond_metadata": metadata})

@@ -34,7 +34,6 @@ from systems.errors import InputError, SurromdError
 from systems.files.whole_file import sealed
 from systems.library.named_scenes import load
 from systems.scene import Scene
-from systems.trajectory.base import json_text, set_text
 from systems.trajectory.checkpoint import (
     checkpoint_path,
     new_header,
@@ -43,6 +42,7 @@ from systems.trajectory.checkpoint import (
     write_checkpoint,
 )
 from systems.trajectory.codec import open_trajectory
+from systems.trajectory.store import json_text, set_text
 from time_limits import time_limit
 
 GONE, MORE = object(), object()

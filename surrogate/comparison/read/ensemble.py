@@ -28,7 +28,7 @@ from surrogate.comparison.read.stored_frames import (
 from systems.errors import InputError, OutOfDomainError, TrajectoryError, listed
 from systems.scene import Scene, part_of
 from systems.trajectory.base import TrajectoryReader
-from systems.trajectory.codec import DIFFERENCE_COLUMN, open_trajectory, replicas_of, reweighting
+from systems.trajectory.codec import DIFFERENCE_COLUMN, open_trajectory, reweighting
 from systems.units import format_time_ps
 
 Frames = npt.NDArray[np.float32] | StoredFrames
@@ -212,8 +212,6 @@ def load_ensemble(
         reader, frames, template, own = open_matched(Path(path), template, None if top is None else Path(top), notes)
         kept.append(own)
         lag, cuts, note = time_axis(str(path), reader.time_ps if reader.times_known else None, reader.n_frames, lag_ps)
-        replicas = replicas_of(reader.record, reader.n_frames)
-        cuts = sorted({*cuts, *(part.start for part, _ in replicas[1:])})
         notes += note
         lags.append(lag)
         grids += [grid_of(reader)] * (len(cuts) + 1)
@@ -232,10 +230,8 @@ def load_ensemble(
         }
         for key, values in of_file.items():
             columns[key] += [] if values is None else np.split(values, cuts)
-        if len(replicas) > 1:
-            notes.append(f"{path}: {len(replicas)} replicas in one file, which are compared as separate runs.")
-        records += [record for _, record in replicas]
-        scalars += [{key: values[part] for key, values in reader.scalars.items()} for part, _ in replicas]
+        records.append(reader.record)
+        scalars.append(reader.scalars)
         if reader.record.get("completed") is False:
             stopped.append(f"{path} ({reader.n_frames} frames)")
     assert template is not None

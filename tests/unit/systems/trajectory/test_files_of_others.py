@@ -210,7 +210,7 @@ def test_every_line_of_the_table_names_a_program_that_is_tried_here() -> None:
     of_rows = {format_of(Path(as_name or name)).name for _, name, as_name, *_ in STORED}
     of_cpptraj = {format_of(Path(f"a.{s}")).name for s in CPPTRAJ}
     of_openmm = {format_of(Path(f"a.{s}")).name for s in ("pdb", "pdbx", "dcd", "xtc", "xml")}
-    elsewhere = {"surromd's and MDTraj's HDF5", "ASE"}  # test_foreign_files, test_formats
+    elsewhere = {"surromd's and MDTraj's HDF5", "ASE"}  # test_foreign_files, test_stated_or_made_up
     assert {f.name for f in FORMATS} - alone == of_rows | of_cpptraj | of_openmm | elsewhere
 
 

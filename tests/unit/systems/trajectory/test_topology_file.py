@@ -11,7 +11,7 @@ import pytest
 
 from surrogate.verbs.outputs import check_outputs
 from systems.errors import SimulationError, TrajectoryError
-from systems.scene import Scene, part_of, reordered
+from systems.scene import Scene, reordered
 from systems.trajectory.checkpoint import locked_outputs
 from systems.trajectory.codec import WRITTEN, open_trajectory, open_writer
 from systems.trajectory.companion_writer import pdb_text
@@ -61,24 +61,6 @@ def test_another_program_s_pdb_is_never_replaced(tmp_path: Path, alanine_dipepti
             check_outputs([path], WRITTEN, overwrite=overwrite)
     assert pdb.read_bytes() == before
     assert [p.name for p in tmp_path.iterdir()] == ["mine.pdb"]
-
-
-@pytest.mark.parametrize("suffix", SUFFIXES)
-def test_a_pdb_of_other_atoms_is_replaced_only_where_nothing_needs_it(
-    tmp_path: Path, alanine_dipeptide: Scene, suffix: str
-) -> None:
-    other = next(s for s in SUFFIXES if s != suffix)
-    heavy = part_of(alanine_dipeptide, alanine_dipeptide.heavy_idx)
-    write(tmp_path / f"a{other}", alanine_dipeptide)
-    before = (tmp_path / "a.pdb").read_bytes()
-    for overwrite in (False, True):
-        with pytest.raises(TrajectoryError, match=rf"a\.pdb is the topology of a{other}"):
-            write(tmp_path / f"a{suffix}", heavy, overwrite=overwrite)
-    assert (tmp_path / "a.pdb").read_bytes() == before
-    write(tmp_path / f"a{suffix}", alanine_dipeptide)  # of the same atoms it serves both
-    (tmp_path / f"a{other}").unlink()
-    write(tmp_path / f"a{suffix}", heavy, overwrite=True)
-    assert (tmp_path / "a.pdb").read_text() == pdb_text(heavy)
 
 
 def test_files_without_a_pdb_are_read_and_gone_on_with(tmp_path: Path, alanine_dipeptide: Scene) -> None:

@@ -14,7 +14,7 @@ import pytest
 from chain_files import RECORD, chain, frames, left_behind, read, write
 from systems.errors import InputError, TrajectoryError
 from systems.trajectory.codec import open_trajectory, open_writer
-from systems.trajectory.companion_writer import XtcReader
+from systems.trajectory.xtc_file import XtcReader
 
 N_ATOMS = 22
 
