@@ -4,7 +4,6 @@ read from files, with what they say of themselves: settings, costs, what guards 
 from __future__ import annotations
 
 import math
-from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -20,9 +19,9 @@ from surrogate.comparison.read.stored_frames import (
     StoredFrames,
     bond_tree,
     grid_of,
+    length_error_nm,
     match_scenes,
     rounded,
-    rounding_note,
     solute_atoms,
 )
 from systems.errors import InputError, OutOfDomainError, TrajectoryError, listed
@@ -41,8 +40,6 @@ STOPPED = "Stopped before the end"
 _LEAST_FRAMES = 10
 # Of a sample of frames, about as many numbers.
 _SAMPLED_VALUES = 20_000_000
-# Scalar column, 0 for a frame that nothing was done about.
-GUARD_COLUMN = "intervention"
 FloatArray = npt.NDArray[np.float64]
 
 # Fewer energies of a reference say nothing of how far its ensemble is the model's.
@@ -65,15 +62,15 @@ def length_words(segment_lengths: Sequence[int], lag_ps: float) -> str:
     return each if len(segment_lengths) == 1 else f"{len(segment_lengths)} replicas of {each}"
 
 
-class InSegments(ABC):
+class InSegments:
     """Base of what holds one value or more for every frame, `lag_ps` apart, in segments of unbroken time."""
 
     lag_ps: float
 
     @property
-    @abstractmethod
     def segment_lengths(self) -> list[int]:
         """Frames in each segment."""
+        raise NotImplementedError
 
     @property
     def n_frames(self) -> int:
@@ -96,10 +93,10 @@ class Ensemble(InSegments):
 
     `segments`: each `(n, n_atoms, 3)` float32 nm, atoms in the order of `scene`, in memory or in their file, to be read
     by slices; `kept`: which atoms of the reference's scene these are, None for all; `lag_ps`: time between frames;
-    `flags` `(n,)` uint16, `chunk_idx` `(n,)` int32 and `changed` `(n,)` bool (what a rollout's guards changed) per
-    segment, or None where the file does not say; `record`: what the writer said of itself (costs summed over files);
-    `sources`: the files; `top`, `stated_lag_ps`: what the user said of them; `notes`: what was done on reading;
-    `grids_nm`: what the coordinates of each segment are rounded to, 0 for nothing (none given: nothing).
+    `flags` `(n,)` uint16 and `chunk_idx` `(n,)` int32 per segment, or None where the file does not say; `record`: what
+    the writer said of itself (costs summed over files); `sources`: the files; `top`, `stated_lag_ps`: what the user
+    said of them; `notes`: what was done on reading; `grids_nm`: what the coordinates of each segment are rounded to, 0
+    for nothing (none given: nothing).
     Raises InputError for shapes that do not fit, no frame at all, or a lag that is not positive.
     """
 
@@ -115,7 +112,6 @@ class Ensemble(InSegments):
     stated_lag_ps: float | None = None
     notes: tuple[str, ...] = ()
     kept: IntArray | None = None
-    changed: Sequence[npt.NDArray[np.bool_]] | None = None
     grids_nm: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
@@ -128,7 +124,7 @@ class Ensemble(InSegments):
                 )
         if self.n_frames == 0:
             raise InputError(f"{self.label}: no frames.")
-        for name, series in (("flags", self.flags), ("chunk_idx", self.chunk_idx), ("changed", self.changed)):
+        for name, series in (("flags", self.flags), ("chunk_idx", self.chunk_idx)):
             if series is not None and [len(s) for s in series] != self.segment_lengths:
                 raise InputError(f"{self.label}: {name} do not match the segments in length.")
 
@@ -153,7 +149,7 @@ class Ensemble(InSegments):
         if stride == 1:
             return self
         segments = [s.thinned(stride) if isinstance(s, StoredFrames) else s[::stride] for s in self.segments]
-        columns = {"flags": self.flags, "chunk_idx": self.chunk_idx, "changed": self.changed}
+        columns = {"flags": self.flags, "chunk_idx": self.chunk_idx}
         thinned: dict[str, Any] = {k: [x[::stride] for x in series] for k, series in columns.items() if series}
         note = f"{self.label}: one frame in {stride} is used, for equal save intervals."
         return replace(self, segments=segments, lag_ps=self.lag_ps * stride, notes=(*self.notes, note), **thinned)
@@ -200,7 +196,7 @@ def load_ensemble(
         raise InputError("No trajectory file was given.")
     name = label or Path(paths[0]).name + (f" + {len(paths) - 1} more" if len(paths) > 1 else "")
     segments: list[Frames] = []
-    columns: dict[str, list[Any]] = {"flags": [], "chunk_idx": [], "changed": []}
+    columns: dict[str, list[Any]] = {"flags": [], "chunk_idx": []}
     records: list[dict[str, Any]] = []
     scalars: list[Mapping[str, FloatArray]] = []
     lags: list[float] = []
@@ -224,14 +220,8 @@ def load_ensemble(
             reader.close()
         else:
             segments += frames.split(cuts)
-        guarded = reader.scalars[GUARD_COLUMN] > 0 if GUARD_COLUMN in reader.scalars else None
-        of_file = {
-            "flags": None if reader.flags is None else np.asarray(reader.flags, dtype=np.uint16),
-            "chunk_idx": None if reader.chunk_idx is None else np.asarray(reader.chunk_idx, dtype=np.int32),
-            "changed": guarded,
-        }
-        for key, values in of_file.items():
-            columns[key] += [] if values is None else np.split(values, cuts)
+        for key, values, kind in (("flags", reader.flags, np.uint16), ("chunk_idx", reader.chunk_idx, np.int32)):
+            columns[key] += [] if values is None else np.split(np.asarray(values, dtype=kind), cuts)
         if len(replicas) > 1:
             notes.append(f"{path}: {len(replicas)} replicas in one file, which are compared as separate runs.")
         records += [record for _, record in replicas]
@@ -296,7 +286,11 @@ def alike(ensembles: Sequence[Ensemble]) -> tuple[list[Ensemble], IntArray | Non
     out = [e.strided(stride) for e, stride in zip(out, strides, strict=True)]
     grid = max(e.grid_nm for e in out)
     if grid > 0:
-        note = rounding_note([e.label for e in out if e.grid_nm == grid], grid)
+        note = (
+            f"{' and '.join(e.label for e in out if e.grid_nm == grid)}: coordinates are rounded to {10 * grid:.3g} Å, "
+            f"which alone makes bond lengths vary by {10 * length_error_nm(grid):.2g} Å; all trajectories are compared "
+            "rounded alike, and what is narrower is hidden."
+        )
         out = [e.on_grid(grid) for e in out]
         out[0] = replace(out[0], notes=(*out[0].notes, note))
     return out, common
@@ -357,11 +351,9 @@ def reweighting_notes(
 def open_matched(
     path: Path, template: Scene | None, top: Path | None, notes: list[str]
 ) -> tuple[TrajectoryReader, StoredFrames, Scene, IntArray]:
-    """Open a file and match its atoms to `template` (its own solute where None); what was done goes to `notes`.
-
-    Returns the reader, its frames in the template's order, the template, and which of its atoms they are. Raises
-    InputError, OutOfDomainError (another molecule), TrajectoryError.
-    """
+    """Open a file and match its atoms to `template` (its own solute where None); what was done goes to `notes`. Return
+    the reader, its frames in the template's order, the template, and which of its atoms they are. Raises InputError,
+    OutOfDomainError (another molecule), TrajectoryError."""
     reader = open_trajectory(path, top=top)
     if reader.n_frames == 0:
         reader.close()
