@@ -290,7 +290,7 @@ def _evaluate(setting: _Setting, candidate: Features, summary: Summary) -> Evalu
     slowest = max(correlation, own)
     cautions = verdict.cautions_of(inputs, slowest, left_open.in_words(setting.convergence))
     status = verdict.status(rows, cautions)
-    # By a reference that may be elsewhere than MD ends, nothing is worth a length of MD.
+    # A reference that may be elsewhere than MD ends gives no equivalent MD time.
     times = () if left_open.why else equivalent_times(reference, candidate, replicate, setting.torsions, options.seed)
     known = effective_samples(min(reference.n_frames, replicate.n_frames), correlation)
     words = ""

@@ -1,8 +1,8 @@
-"""How many nanoseconds of MD a candidate is worth: the length at which MD is as far from the reference as the
-candidate is, by histograms of torsions and by autocorrelation.
+"""The equivalent MD time of a candidate: the length at which MD is as far from the reference as the candidate is, by
+histograms of torsions and by autocorrelation.
 
-Reference and replicate are one simulation, run twice. Pieces of the one, of every length, are held against the whole
-of the other, and so is the candidate; both stand against the same reference, so its own noise is in both.
+Reference and replicate are one simulation, run twice. Pieces of the one, of every length, are compared with the whole
+of the other, and so is the candidate; both with the same reference, so its own noise is in both.
 """
 
 from __future__ import annotations
@@ -229,8 +229,8 @@ def headline(
     found: Sequence[EquivalentTime], cost_ratio: Callable[[EquivalentTime], float | None], length_ps: float
 ) -> str:
     """Return 'Equivalent MD time 38 ns [25 ns, 60 ns] by its φ/ψ map, at 1/900 of its cost; by its kinetics 3 ns
-    [...].' Empty without a measure. `cost_ratio(worth)`: the cost of that much MD over that of the share of the
-    candidate which is worth it, None when a cost is unknown; `length_ps`: of the candidate."""
+    [...].' Empty without a measure. `cost_ratio(found)`: the cost of that much MD over that of the share of the
+    candidate which equals it, None when a cost is unknown; `length_ps`: of the candidate."""
     first = next((w for w in found if w.kind == "distribution"), None)
     if first is None:
         return ""

@@ -135,12 +135,10 @@ def timescale(eigenvalue: npt.ArrayLike, lag: float) -> FloatArray:
 
 
 def noise_timescale(n_parameters: int, lag: float, n_frames: float) -> float:
-    """Return the timescale, in the unit of `lag`, that a process found among so many parameters has by chance.
-
-    `lag` and `n_frames` in frames. The greatest eigenvalue of noise goes with the root of parameters over independent
-    pairs (Marchenko and Pastur); half of it is a choice, made on replicas of rigid molecules. Infinite: no process can
-    be told from noise.
-    """
+    """Return the timescale, in the unit of `lag`, that a process found among so many parameters has by chance; infinite
+    where every process may be noise. `lag` and `n_frames` in frames. The greatest eigenvalue of noise goes with the
+    root of parameters over independent pairs (Marchenko and Pastur); half of it is a choice, made on replicas of rigid
+    molecules."""
     eigenvalue = 0.5 * math.sqrt(n_parameters * lag / max(n_frames, 1.0))
     return math.inf if eigenvalue >= 1.0 else float(timescale(eigenvalue, lag))
 

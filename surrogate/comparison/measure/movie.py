@@ -83,10 +83,8 @@ def make_movie(
     reference: Ensemble, candidate: Ensemble, reference_features: Features, candidate_features: Features, n_frames: int
 ) -> Movie:
     """Return the movie of the first `n_frames` of both: a clip over the whole length, and one of consecutive frames.
-
-    Every frame is laid over the reference's first finite one by its heavy atoms (all atoms where fewer than three are
-    heavy), which is turned so that its longest axis lies across the picture. Hydrogens are left out above 300 atoms.
-    """
+    Every frame is laid over the reference's first finite one by its heavy atoms (all where fewer than three are heavy),
+    which is turned so that its longest axis lies across the picture. Hydrogens are left out above 300 atoms."""
     scene = reference.scene
     every, heavy = np.arange(scene.n_atoms), scene.heavy_idx
     shown = every if scene.n_atoms <= HYDROGENS_UP_TO else heavy

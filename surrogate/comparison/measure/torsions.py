@@ -29,8 +29,8 @@ _LEAST_PEAK = 1e-3
 class Torsion(NamedTuple):
     """One torsion: its four atoms, a name for people, its kind, and by how many equal positions it is folded. A `fold`
     of m means that turning by 2π/m gives the same molecule (3 for methyl, 2 for phenyl): m times the angle is measured.
-    `equal` are the atoms from which it could as well be told, `quad` among them: the direction of the mean over them is
-    taken, so that it does not matter which hydrogen of a methyl group is called the first."""
+    `equal` are the atoms that could be used as well, `quad` among them: the direction of the mean over them is taken,
+    so that it does not matter which hydrogen of a methyl group is called the first."""
 
     quad: Quad
     label: str
@@ -46,13 +46,10 @@ def residue_label(scene: Scene, atom: int) -> str:
 
 
 def find_torsions(scene: Scene) -> list[Torsion]:
-    """Return omega of every peptide bond, chi of every side chain, every other rotatable bond and every rotor, and one
-    torsion within every ring of 4 to 7 atoms that is not flat, which tells its pucker.
-
-    Found in the bond graph; phi and psi are left out (`structure.backbone` has them). A rotor is a group whose only
-    further atoms are hydrogens (methyl, hydroxyl, ammonium). Chi is named and its atoms chosen as MDTraj does, by the
-    names of atoms.
-    """
+    """Return omega of every peptide bond, chi of every side chain (MDTraj's, by the names of atoms), every other
+    rotatable bond, every rotor, a group whose only further atoms are hydrogens (methyl, hydroxyl, ammonium), and one
+    torsion within every ring of 4 to 7 atoms that is not flat, which shows its pucker. Phi and psi are left out
+    (`structure.backbone` has them)."""
     graph = bonded_graph(scene)
     backbone = backbone_torsions(scene)
     classes = atom_classes(scene).tolist()

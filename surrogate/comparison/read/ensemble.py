@@ -35,7 +35,7 @@ Flags = npt.NDArray[np.uint16]
 IntArray = npt.NDArray[np.int64]
 
 IN_MEMORY_BYTES = 128 * 2**20
-# What a note begins with of files that hold fewer frames than were asked for.
+# How a note begins on files of runs that ended early.
 STOPPED = "Stopped before the end"
 _LEAST_FRAMES = 10
 # Of a sample of frames, about as many numbers.
@@ -181,16 +181,16 @@ def load_ensemble(
     lag_ps: float | None = None,
     in_memory_bytes: int = IN_MEMORY_BYTES,
 ) -> Ensemble:
-    """Read one or several trajectory files as the replicas of one candidate.
+    """Read one or several trajectory files, of any format that MDTraj or MDAnalysis reads, as the replicas of one
+    candidate.
 
-    Any format that MDTraj or MDAnalysis reads. Atoms are put in the order of `template` (matched by the bond graph
-    where order or names differ); a file that holds only some of them (no hydrogens, backbone) gives an ensemble of
-    those, named in `kept`. Without a template the first file's scene is it, less water and single ions. Molecules of a
-    periodic file are made whole. A file whose time jumps is cut there into segments. `lag_ps` overrides the times in
-    the files. `top` is the topology for formats that hold none. Files beyond the first `in_memory_bytes` of all
-    coordinates together are left where they are and read block by block. Raises InputError (no files, nothing known of
-    the topology, no times without `lag_ps`, replicas with different lags or atoms), OutOfDomainError (another molecule)
-    and TrajectoryError (a damaged file, uneven time).
+    Atoms are put in the order of `template` (matched by the bond graph where order or names differ); a file that holds
+    only some of them gives an ensemble of those, named in `kept`. Without a template the first file's scene is it, less
+    water and single ions. Molecules of a periodic file are made whole; a file whose time jumps is cut there into
+    segments. `lag_ps` overrides the times in the files, `top` is the topology for formats that hold none. Files beyond
+    the first `in_memory_bytes` of all coordinates together are read block by block. Raises InputError (no files, no
+    topology, no times without `lag_ps`, replicas with different lags or atoms), OutOfDomainError (another molecule) and
+    TrajectoryError (a damaged file, uneven time).
     """
     if not paths:
         raise InputError("No trajectory file was given.")
@@ -257,11 +257,9 @@ def load_ensemble(
 
 def alike(ensembles: Sequence[Ensemble]) -> tuple[list[Ensemble], IntArray | None]:
     """Return the ensembles on the atoms that all of them hold, thinned by whole strides to their least common save
-    interval, rounded to the coarsest grid of any; and which of the first's atoms these are (None: all).
-
-    The first is the reference, in whose atoms the others' `kept` counts. Raises InputError when fewer than three atoms
-    are left, or when no common interval leaves 10 frames of each.
-    """
+    interval, rounded to the coarsest grid of any; and which of the first's (the reference's) atoms these are (None:
+    all). Raises InputError when fewer than three atoms are left, or when no common interval leaves 10 frames of
+    each."""
     reference, out = ensembles[0], list(ensembles)
     every = np.arange(reference.scene.n_atoms)
     parts = [e.kept for e in out[1:] if e.kept is not None]

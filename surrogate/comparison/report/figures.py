@@ -67,7 +67,7 @@ _NAME_WIDTH = 20
 _MOST_MAPS, _MOST_CHARTS = 6, 12
 _MOST_ROWS, _MOST_HISTOGRAMS, _MOST_ANSWER_MAPS = 4, 6, 6
 _TITLES: dict[Section, str] = {
-    "equivalent_time": "What it is worth",
+    "equivalent_time": "Equivalent MD time",
     "distributions": "Distributions",
     "kinetics": "How fast things move",
     "structure": "Structure",

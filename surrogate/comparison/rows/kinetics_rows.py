@@ -269,7 +269,7 @@ def _markov_model(inputs: ComparisonInput, coordinates: Sequence[list[FloatArray
         return left_out(name, "the reference visits too few states, or none that hold together")
     noise_ps = inputs.lag_ps * noise_timescale(len(model.centres), lag, inputs.reference.features.n_frames)
     if not len(model.timescales) or inputs.lag_ps * model.timescales[0] < noise_ps:
-        return left_out(name, "its slowest process cannot be told from noise")
+        return left_out(name, "its slowest process may be noise")
     states = [_states(model, s, r, x) for s, r, x in zip(inputs.samples, ROLES, coordinates, strict=True)]
     names = state_names(inputs, states[0].macro, model.n_states)
     metric = f"Populations of {model.n_states} metastable states, distance"
@@ -340,7 +340,7 @@ def _timescale_rows(
             continue
         values = [float(timescale(function_eigenvalue(s.micro_counts, function), lag)) for s in states]
         if values[0] < noise_ps:
-            skipped.append((name, f"{values[0]:.2g} ps: cannot be told from noise at this lag"))
+            skipped.append((name, f"{values[0]:.2g} ps: may be noise at this lag"))
             continue
         draws = [timescale(function_eigenvalue(s.micro_counts, function, s.sample.weights), lag) for s in states]
         if missing_in_replicate.any():

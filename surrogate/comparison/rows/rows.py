@@ -121,11 +121,11 @@ def left_out(name: str, why: str) -> Measured:
 class Row:
     """One metric of one candidate, between the reference and its replicate.
 
-    `form` says how it is evaluated: a "distance" to the reference stands beside the replicate's, and `ratio` is to that
-    replicate baseline; an "observable" is compared with the reference's own value, and `ratio` is to that; a "share" is
-    the part of frames that pass a check. `statement` puts the deviation in words. `p_value` tests the candidate against
-    reference and replicate together, `p_replicate` the replicate against the reference; `p_corrected` is Holm's over
-    all rows. `kind` and `time_scale` are those of the `Metric` that measured it.
+    `form`: a "distance" to the reference is compared with the replicate's, and `ratio` is to that; an "observable" is
+    compared with the reference's own value, and `ratio` is to that; a "share" is the part of frames that pass a check.
+    `statement` puts the deviation in words. `p_value` tests the candidate against reference and replicate together,
+    `p_replicate` the replicate against the reference; `p_corrected` is Holm's over all rows. `kind` and `time_scale`
+    are those of the `Metric` that measured it.
     """
 
     key: str
@@ -290,10 +290,10 @@ def distance_row(
         with np.errstate(invalid="ignore", divide="ignore"):
             ratio = estimate(to_candidate / to_replicate, draws_candidate / draws_replicate, n_blocks, log=True)
     rng = np.random.default_rng([inputs.options.seed, 99])
-    kinds = [np.zeros(len(c), dtype=np.int64) for c in flat] if strata is None else strata
+    strata = strata or [np.zeros(len(c), dtype=np.int64) for c in flat]
 
     def p_of(other: int, *sources: int) -> float:
-        of_block = np.concatenate([kinds[k] for k in (*sources, other)])
+        of_block = np.concatenate([strata[k] for k in (*sources, other)])
         pool = np.concatenate([flat[k] for k in sources])
         return permutation_p(pool, flat[other], mean_distance, rng, inputs.options.n_permutations, of_block)
 

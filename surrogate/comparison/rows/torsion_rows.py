@@ -13,7 +13,7 @@ import itertools
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 
@@ -105,11 +105,8 @@ def population_rows(inputs: ComparisonInput) -> Measured:
     found = [("ψ in the β basin", x) for x in inputs.torsions.psi_labels]
     found += [("φ > 0", x) for x in inputs.torsions.phi_labels]
     n_psi = len(inputs.torsions.psi_labels)
-    skipped: list[Skipped] = []
     if not found:
-        skipped.append(("Torsion distributions, basins, autocorrelation", "the scene has no φ or ψ torsion"))
-    elif not inputs.torsions.residues:
-        skipped.append(("Joint φ/ψ maps", "no residue has both torsions"))
+        return left_out("Torsion distributions, basins, autocorrelation", "the scene has no φ or ψ torsion")
 
     def members(f: Features) -> list[AnyFloat]:
         angles = zip(f.phi, f.psi, strict=True)
@@ -128,7 +125,7 @@ def population_rows(inputs: ComparisonInput) -> Measured:
         tolerance = min(share, 100.0 - share) * ONE_KJ_SHARE
         key, said = f"population:{name}:{label}", f"{name}, {label}"
         rows.append(mean_row(inputs, Quantity(key, "populations", said, "%", tolerance, "± 1 kJ/mol"), means, k))
-    return Measured(rows, skipped=skipped)
+    return Measured(rows)
 
 
 def torsion_rows(inputs: ComparisonInput) -> Measured:
@@ -137,11 +134,11 @@ def torsion_rows(inputs: ComparisonInput) -> Measured:
     all, of many residues of some."""
     many = _are_many(inputs)
     rows: list[Row] = []
-    for key, group in itertools.groupby(_each_histogram(inputs, many), lambda found: found[0]):
+    for key, group in itertools.groupby(_histograms(inputs, many), lambda found: found.key):
         for part in [list(group)] if many else ([one] for one in group):
-            label = f"mean of {len(part)} residues" if many else part[0][2]
-            counts = [np.stack(of_sample, axis=1) for of_sample in zip(*(x[3] for x in part), strict=True)]
-            metric = f"{part[0][1]} distance, {label}"
+            label = f"mean of {len(part)} residues" if many else part[0].label
+            counts = [np.stack(of_sample, axis=1) for of_sample in zip(*(x.counts for x in part), strict=True)]
+            metric = f"{part[0].name} distance, {label}"
             rows.append(distance_row(inputs, counts, f"{key}:{label}", "distributions", metric))
     charts: list[Chart] = [_map(inputs, residue) for residue in evenly(inputs.torsions.residues, _MOST_DRAWN)]
     for symbol, name, labels in _phi_psi(inputs):
@@ -154,23 +151,32 @@ def _phi_psi(inputs: ComparisonInput) -> list[tuple[str, Literal["phi", "psi"], 
     return [("φ", "phi", inputs.torsions.phi_labels), ("ψ", "psi", inputs.torsions.psi_labels)]
 
 
-def _each_histogram(inputs: ComparisonInput, many: bool) -> Iterator[tuple[str, str, str, list[FloatArray]]]:
-    """Yield of every map and every single torsion (of `many` some) the key, its name, whose it is, and counts per block
-    of each sample, without phi > 0 where that is rare."""
+class _Histogram(NamedTuple):
+    """A φ/ψ map or one torsion of a residue: `counts` per block of (reference, candidate, replicate)."""
+
+    key: str
+    name: str
+    label: str
+    counts: list[FloatArray]
+
+    def at_negative_phi(self, bins: Bins) -> _Histogram:
+        """Return the same without phi > 0."""
+        counts = [without_positive_phi(c, bins.n) for c in self.counts]
+        return self._replace(name=f"{self.name} at φ < 0", counts=counts)
+
+
+def _histograms(inputs: ComparisonInput, many: bool) -> Iterator[_Histogram]:
+    """Yield the map and the single torsions of every residue, of `many` of some; without phi > 0 where that is rare."""
     residues, rare = inputs.torsions.residues, frozenset[int]() if many else rare_residues(inputs)
-
-    def without(counts: list[FloatArray], name: str, bins: Bins, is_rare: bool) -> tuple[str, list[FloatArray]]:
-        return (f"{name} at φ < 0", [without_positive_phi(c, bins.n) for c in counts]) if is_rare else (name, counts)
-
     for residue in evenly(residues, MOST_MAPS) if many else residues:
         counts = [joint_counts(s.features, s.blocks, residue) for s in inputs.samples]
-        name, counts = without(counts, "Joint φ/ψ", RAMACHANDRAN_BINS, residue.phi in rare)
-        yield "joint_jsd", name, residue.label, counts
+        found = _Histogram("joint_jsd", "Joint φ/ψ", residue.label, counts)
+        yield found.at_negative_phi(RAMACHANDRAN_BINS) if residue.phi in rare else found
     for symbol, angle, labels in _phi_psi(inputs):
         for k, label in evenly(list(enumerate(labels)), MOST_HISTOGRAMS if many else len(labels)):
             counts = series_counts(inputs, inputs.column(angle, k), TORSION_BINS)
-            name, counts = without(counts, symbol, TORSION_BINS, angle == "phi" and k in rare)
-            yield f"{angle}_jsd", name, label, counts
+            found = _Histogram(f"{angle}_jsd", symbol, label, counts)
+            yield found.at_negative_phi(TORSION_BINS) if angle == "phi" and k in rare else found
 
 
 def joint_counts(f: Features, blocks: Blocks, residue: Residue) -> FloatArray:

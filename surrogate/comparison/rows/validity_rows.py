@@ -41,7 +41,7 @@ _ENERGY = "Potential energy"
 N_ENERGIES = 400
 _HIGH_QUANTILE = 0.99
 _BINS = 40
-# Of what tells frames apart: so many angles, on a grid in rad.
+# Frames are compared by so many angles, on a grid in rad.
 _KEY_COLUMNS, _GRID = 6, 1e-3
 # Copies are named from this share on; a candidate of which so much is the reference's own is not compared.
 _NAMED_SHARE, _MOSTLY = 0.01, 0.5
