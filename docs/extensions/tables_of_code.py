@@ -14,10 +14,10 @@ class Definitions(SphinxDirective):
     """`{definitions}`: the comparison's terms, as its report defines them."""
 
     def run(self) -> list[nodes.Node]:
-        from surrogate.comparison.report.definitions import DEFINITIONS
+        from surrogate.comparison.report.report import definitions
 
         parts = []
-        for one in DEFINITIONS:
+        for one in definitions():
             source = f" *{_plain(one.source)}*" if one.source else ""
             parts.append(f"{_plain(one.term)}\n: {_plain(one.meaning)}{source}\n")
         return self.parse_text_to_nodes("\n".join(parts))

@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
 from surrogate.comparison import verdict
 from surrogate.comparison.convergence import NOTHING_OPEN, Convergence, Explained, convergence_of, explain
@@ -22,13 +21,7 @@ from surrogate.comparison.read.ensemble import Ensemble, alike
 from surrogate.comparison.rows.charts import Chart, jsonable
 from surrogate.comparison.rows.rows import ComparisonInput, Options, Row, Sample, by_group, make_sample
 from surrogate.comparison.rows.torsion_rows import FEW_RESIDUES
-from surrogate.comparison.rows.validity_rows import (
-    EnergyFn,
-    applicable_checks,
-    copied_from,
-    measure_energies,
-    places_in_chunk,
-)
+from surrogate.comparison.rows.validity_rows import CHECKS, EnergyFn, copied_from, measure_energies, unchecked
 from systems.chemistry import validity
 from systems.chemistry.element_data import covalent_radius_nm
 from systems.chemistry.validity import Geometry
@@ -55,12 +48,9 @@ _MOST_TIMES_AS_LONG = 20
 
 @dataclass(frozen=True)
 class Summary:
-    """What one trajectory is: where from, how long, how it was made, what it cost.
-
-    `top` and `stated_lag_ps` are what the user said of the files; `total_ps`, `n_frames` are of the whole input;
-    `length` says it as what it is ('32 replicas of 3.8 ns'); `ns_per_day` and `wall_s` are None where its record holds
-    no cost.
-    """
+    """What one trajectory is: where from, how long, how it was made, what it cost. `top` and `stated_lag_ps` are what
+    the user said of the files; `total_ps`, `n_frames` are of the whole input; `ns_per_day` and `wall_s` are None where
+    its record holds no cost."""
 
     label: str
     sources: tuple[str, ...]
@@ -79,15 +69,12 @@ class Summary:
 
 @dataclass(frozen=True)
 class Faults:
-    """How many of the compared frames carry each validity flag, when the first invalid one comes, and how many chunks
-    they were made in."""
+    """How many of the compared frames carry each validity flag, and when the first invalid one comes."""
 
-    label: str
     n_frames: int
     counts: dict[str, int]
     n_invalid: int
     first_invalid_ps: float | None
-    n_chunks: int = 0
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,13 +82,11 @@ class Evaluation:
     """One candidate against the reference: rows with a word each, what is wrong (worst first), and the verdict.
 
     `compared_ps` and `n_frames` are the equal length of all three; `block_ps` and `n_blocks` (of the reference) stand
-    behind the error bars; `correlation_ps` is the integrated autocorrelation time of the slowest motion in reference
-    and replicate; `effective_samples` are the independent ones that the equal length holds of the slowest motion of any
-    of the three; `speed_ratio` is simulated time per wall second over the reference's; `faults` of (reference,
-    candidate, replicate). `equivalent_time` says by each measure how much MD the whole candidate is worth, and
-    `equivalent_time_words` says it in a sentence (empty where it is not known, or frames are broken, or the reference
-    still depends on where it started). `left_open`: what the reference's start or length leaves open; `in_short`: use
-    it or not, for what, why.
+    behind the error bars; `effective_samples` are the independent ones that the equal length holds of the slowest
+    motion of any; `speed_ratio` is simulated time per wall second over the reference's; `faults` of (reference,
+    candidate, replicate). `equivalent_time_words` is empty where it is not known, frames are broken, or the reference
+    depends on where it started. `left_open`: what the reference's start or length leaves open; `in_short`: use it or
+    not, for what, why.
     """
 
     summary: Summary
@@ -113,7 +98,6 @@ class Evaluation:
     n_frames: int
     block_ps: float
     n_blocks: int
-    correlation_ps: float
     effective_samples: float
     speed_ratio: float | None
     faults: tuple[Faults, Faults, Faults]
@@ -228,7 +212,7 @@ def compare(
     n = len(candidates)
     ref, rolled, rep = thinned[0], thinned[1 : 1 + n], None if replicate is None else thinned[-1]
     for ensemble in (ref,) if rep is None else (ref, rep):
-        _refuse_wrong_topology(ensemble.label, stage, ensemble.sample(_FRAMES_FOR_BONDS))
+        _topology_note(ensemble, stage, refuse=True)
     baseline = Baseline.of(ref, parent=whole, kept=kept)
     measured = [baseline.measure(e) for e in thinned]
     if energy_fn is not None and kept is None:
@@ -236,9 +220,7 @@ def compare(
             replace(m, energy_kj=measure_energies(e, energy_fn)) for m, e in zip(measured, thinned, strict=True)
         ]
     notes = [note for e in thinned for note in e.notes]
-    for ensemble in rolled:
-        long, said = _bonds_that_are_none(stage, ensemble.sample(_FRAMES_FOR_BONDS))
-        notes += [f"{ensemble.label}: {said}; does its topology fit its coordinates?"] if long else []
+    notes += [note for e in rolled if (note := _topology_note(e, stage, refuse=False))]
     notes += [note for features in measured for note in _jump_notes(features)]
     known = (measured[0],) if rep is None else (measured[0], measured[-1])
     convergence = convergence_of(known, baseline.torsions, seed=options.seed)
@@ -265,7 +247,7 @@ def compare(
         known, convergence,
     )  # fmt: skip
     own = list(zip(measured[1 : 1 + n], summaries[1 : 1 + n], rolled, strict=True))
-    evaluations = tuple(_evaluate(setting, m, summary, (ref, e, rep)) for m, summary, e in own)
+    evaluations = tuple(_evaluate(setting, m, summary) for m, summary, _ in own)
     notes += [f"Validity check left out: {x}." for x in baseline.geometry.excluded]
     return Comparison(
         scene_name=stage.name,
@@ -294,12 +276,9 @@ def _start_notes(candidates: Sequence[Features], torsions: Backbone, seed: int) 
     return [f"{label} itself is {found.verdict}" for label, found in tested if found.n_replicas and not found.converged]
 
 
-def _evaluate(
-    setting: _Setting, candidate: Features, summary: Summary, trajectories: tuple[Ensemble, Ensemble, Ensemble | None]
-) -> Evaluation:
-    """Evaluate one candidate; `summary`: what its file says of it; `trajectories`: see `ComparisonInput`."""
+def _evaluate(setting: _Setting, candidate: Features, summary: Summary) -> Evaluation:
+    """Evaluate one candidate; `summary`: what its file says of it."""
     inputs, correlation, own = _equal_terms(setting, candidate)
-    inputs = replace(inputs, trajectories=trajectories)
     reference, replicate, options = setting.reference, setting.replicate, setting.options
     found_rows, charts, skipped = measure_all(METRICS, inputs)
     n_compared = round(inputs.compared_ps / inputs.lag_ps)
@@ -311,8 +290,8 @@ def _evaluate(
     slowest = max(correlation, own)
     cautions = verdict.cautions_of(inputs, slowest, left_open.in_words(setting.convergence))
     status = verdict.status(rows, cautions)
-    # By a reference that may be elsewhere than MD ends, nothing is worth a length of MD.
-    times = () if left_open.why else equivalent_times(reference, candidate, replicate, setting.torsions, options)
+    # A reference that may be elsewhere than MD ends gives no equivalent MD time.
+    times = () if left_open.why else equivalent_times(reference, candidate, replicate, setting.torsions, options.seed)
     known = effective_samples(min(reference.n_frames, replicate.n_frames), correlation)
     words = ""
     if status != "broken" and not (cautions.apart or cautions.copied) and known >= verdict.LEAST_FOR_EQUIVALENT_TIME:
@@ -322,7 +301,7 @@ def _evaluate(
     shortest = min((s.features for s in inputs.samples), key=lambda f: f.total_ps)
     said = verdict.sentence(rows, found, shortest.length_words, cautions)
     faults = [_faults_of(s, setting.geometry) for s in inputs.samples]
-    blocks = inputs.reference.blocks
+    blocks, md_speed = inputs.reference.blocks, setting.summary.ns_per_day
     return Evaluation(
         summary=summary,
         status=status,
@@ -333,9 +312,8 @@ def _evaluate(
         n_frames=min(s.features.n_frames for s in inputs.samples),
         block_ps=blocks.n_frames_each * inputs.lag_ps,
         n_blocks=blocks.n_blocks,
-        correlation_ps=correlation * inputs.lag_ps,
         effective_samples=effective_samples(n_compared, slowest),
-        speed_ratio=speed_ratio(summary, setting.summary),
+        speed_ratio=None if summary.ns_per_day is None or md_speed is None else summary.ns_per_day / md_speed,
         faults=(faults[0], faults[1], faults[2]),
         skipped=tuple(skipped),
         notes=(
@@ -353,11 +331,9 @@ def _evaluate(
 
 
 def _equal_terms(setting: _Setting, candidate: Features) -> tuple[ComparisonInput, float, float]:
-    """Divide all three into blocks of one length, of which the first of each are as long as the shortest of the three;
-    return them, and in frames the slowest time of the reference and that of the candidate.
-
-    All of a longer reference takes part in the tests, up to `_MOST_TIMES_AS_LONG` times the candidate's length.
-    """
+    """Divide all three into blocks of one length, of which the first of each are as long as the shortest of the three,
+    and keep at most `_MOST_TIMES_AS_LONG` times that length; return them, and in frames the slowest time of the
+    reference and that of the candidate."""
     reference, replicate, torsions = setting.reference, setting.replicate, setting.torsions
     n = min(reference.n_frames, candidate.n_frames, replicate.n_frames)
     if n < _MIN_FRAMES:
@@ -390,33 +366,31 @@ def _trimming(inputs: ComparisonInput, *trajectories: Features) -> list[str]:
     ]
 
 
-def _refuse_wrong_topology(label: str, scene: Scene, frames: npt.NDArray[np.float32]) -> None:
-    """Raise InputError where frames of a reference have bonds that are none: its topology does not fit them."""
-    long, words = _bonds_that_are_none(scene, frames)
-    if long >= _REFUSED[0] and long >= _REFUSED[1] * len(scene.bonds):
-        raise InputError(
-            f"{label}: {words}. The topology does not fit the coordinates, whose atoms are in another order; "
-            "name the one that belongs to them with `top`."
-        )
-
-
-def _bonds_that_are_none(scene: Scene, frames: npt.NDArray[np.float32]) -> tuple[int, str]:
-    """Return how many bonds are longer, in the median of frames `(n, n_atoms, 3)` nm, than any bond between such
-    elements is, and say so."""
+def _topology_note(ensemble: Ensemble, scene: Scene, *, refuse: bool) -> str:
+    """Return which bonds are longer, in the median of some frames, than any bond between such elements is; empty where
+    none is. Raises InputError, where asked to `refuse`, for so many that the topology cannot fit."""
+    frames = ensemble.sample(_FRAMES_FOR_BONDS)
     if scene.interactions is not None or not len(scene.bonds) or not len(frames):
-        return 0, ""
+        return ""
     i, j = scene.bonds.T
     length = np.median(np.linalg.norm(frames[:, i] - frames[:, j], axis=-1), axis=0)
     try:
         radii = np.array([covalent_radius_nm(e) for e in scene.elements])
     except KeyError:  # virtual sites have no size
-        return 0, ""
+        return ""
     long = np.flatnonzero(length > _LONGEST_BOND * (radii[i] + radii[j]))
     if not len(long):
-        return 0, ""
+        return ""
     worst = int(long[np.argmax(length[long])])
     name = bond_label(scene, int(i[worst]), int(j[worst]))
-    return len(long), f"{len(long)} of {len(length)} bonds are no bonds, such as {name} of {10 * length[worst]:.2g} Å"
+    such_as = f"{name} of {10 * length[worst]:.2g} Å"
+    said = f"{ensemble.label}: {len(long)} of {len(length)} bonds are no bonds, such as {such_as}"
+    if refuse and len(long) >= max(_REFUSED[0], _REFUSED[1] * len(length)):
+        raise InputError(
+            f"{said}. The topology does not fit the coordinates, whose atoms are in another order; name the one that "
+            "belongs to them with `top`."
+        )
+    return f"{said}; does its topology fit its coordinates?"
 
 
 def _jump_notes(features: Features) -> list[str]:
@@ -454,13 +428,13 @@ def _versions() -> dict[str, str]:
 def _faults_of(sample: Sample, geometry: Geometry) -> Faults:
     """Count the flags of the frames of one sample, of those checks that the geometry has something for; the first
     invalid frame by its time in its segment."""
-    features = sample.features
+    features, nothing = sample.features, unchecked(geometry)
     flags = np.concatenate(list(features.flags))
-    counts = {validity.flag_names(c.mask)[0]: int(((flags & c.mask) != 0).sum()) for c in applicable_checks(geometry)}
+    masks = [check.mask for check in CHECKS if check.mask not in nothing]
+    counts = {validity.flag_names(mask)[0]: int(((flags & mask) != 0).sum()) for mask in masks}
     invalid = [(f & validity.INVALID) != 0 for f in features.flags]
     first_ps = min((int(np.argmax(f)) * features.lag_ps for f in invalid if f.any()), default=None)
-    n_invalid, n_chunks = sum(int(f.sum()) for f in invalid), int((places_in_chunk(features) == 0).sum())
-    return Faults(features.label, len(flags), counts, n_invalid, first_ps, n_chunks)
+    return Faults(len(flags), counts, sum(int(f.sum()) for f in invalid), first_ps)
 
 
 def summary_of(ensemble: Ensemble) -> Summary:
@@ -485,13 +459,6 @@ def summary_of(ensemble: Ensemble) -> Summary:
         cost=cost,
         length=ensemble.length_words,
     )
-
-
-def speed_ratio(candidate: Summary, reference: Summary) -> float | None:
-    """Return simulated time per wall second over the reference's; None when one of the two holds no cost."""
-    if candidate.ns_per_day is None or reference.ns_per_day is None:
-        return None
-    return candidate.ns_per_day / reference.ns_per_day
 
 
 def cost_ratio(equivalent_ps: float, share: float, candidate: Summary, reference: Summary) -> float | None:

@@ -1,8 +1,8 @@
-"""How many nanoseconds of MD a candidate is worth: the length at which MD is as far from the reference as the
-candidate is, by histograms of torsions and of TIC 0, bonds, autocorrelation.
+"""The equivalent MD time of a candidate: the length at which MD is as far from the reference as the candidate is, by
+histograms of torsions and by autocorrelation.
 
-Reference and replicate are one simulation, run twice. Pieces of the one, of every length, are held against the whole
-of the other, and so is the candidate; both stand against the same reference, so its own noise is in both.
+Reference and replicate are one simulation, run twice. Pieces of the one, of every length, are compared with the whole
+of the other, and so is the candidate; both with the same reference, so its own noise is in both.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import numpy as np
 
 from surrogate.comparison.measure import distributions, kinetics
 from surrogate.comparison.measure.distributions import TORSION_BINS
-from surrogate.comparison.measure.slow_motion import longest_correlation, slow_torsions, tica_features
+from surrogate.comparison.measure.slow_motion import longest_correlation, slow_torsions
 from surrogate.comparison.measure.statistics import (
     Blocks,
     Estimate,
@@ -24,13 +24,12 @@ from surrogate.comparison.measure.statistics import (
     Piece,
     block_length,
     bootstrap_weights,
-    estimate,
     make_blocks,
 )
 from surrogate.comparison.measure.structure import MOST_HISTOGRAMS, Backbone, Features, evenly
 from surrogate.comparison.rows.charts import Line, LineChart
 from surrogate.comparison.rows.kinetics_rows import turning
-from surrogate.comparison.rows.rows import Options
+from surrogate.comparison.rows.rows import distance_estimate
 from surrogate.comparison.rows.torsion_rows import MOST_MAPS, joint_counts
 from systems.units import format_time_ps
 
@@ -39,7 +38,6 @@ Kind = Literal["distribution", "kinetics"]
 Three = Sequence[tuple[Features, Blocks]]
 
 _MANY_PIECES = 8
-_UNITS = (("us", 1e6), ("ns", 1e3), ("ps", 1.0))
 _NORMAL_95 = 1.959964
 # Pieces run from the whole length down to this share of it, halving each time.
 SHORTEST_SHARE = 128
@@ -52,11 +50,9 @@ class EquivalentTime:
     """The equivalent MD time of a candidate by one measure, in ps of MD, with its 95 % interval.
 
     `candidate_error` is its distance to the reference; MD of `lengths_ps` `(n,)`, ascending, has `errors` `(n,)`, the
-    geometric mean over pieces, which scatter between `errors_low` and `errors_high` (10 % and 90 % quantiles).
-    `bound` says where the equivalent MD time lies when the candidate is better than the longest MD at hand ("at least")
-    or worse than the shortest ("less than"); an end of the interval beyond that range is None. `share` of the candidate
-    is what this much is the equivalent MD time of: all of it, or, where MD at hand ends first, the shortest parts that
-    come as near.
+    geometric mean over pieces, which scatter between `errors_low` and `errors_high` (10 % and 90 % quantiles). `bound`:
+    beyond which end of the MD at hand it lies; an end of the interval beyond that range is None. `share`: of the
+    candidate, where MD at hand ends first: the shortest parts that come as near.
     """
 
     key: str
@@ -78,17 +74,9 @@ class EquivalentTime:
         length = format_time_ps(self.equivalent_ps, 2)
         if self.bound == "less than" or (self.bound == "at least" and self.low_ps is None):
             return f"{self.bound} {length}"
-        longest = self.equivalent_ps if self.bound else self.lengths_ps[-1] if self.high_ps is None else self.high_ps
-        unit, factor = next((u for u in _UNITS if longest >= u[1]), _UNITS[-1])
-
-        def words(time_ps: float) -> str:
-            return f"{float(f'{time_ps / factor:.2g}'):g} {unit}"
-
-        low = f"< {words(self.lengths_ps[0])}" if self.low_ps is None else words(self.low_ps)
-        high = f"> {words(self.lengths_ps[-1])}" if self.high_ps is None else words(self.high_ps)
-        if self.bound:
-            return f"{self.bound} {length} [{low}, ...]"
-        return f"{length} [{low}, {high}]"
+        ends = ((self.low_ps, "<", self.lengths_ps[0]), (self.high_ps, ">", self.lengths_ps[-1]))
+        low, high = (f"{sign} {format_time_ps(at, 2)}" if x is None else format_time_ps(x, 2) for x, sign, at in ends)
+        return f"{self.bound} {length} [{low}, ...]" if self.bound else f"{length} [{low}, {high}]"
 
     def error_at(self, share: float) -> float:
         """Return the error of MD of `share` of the longest length, between neighbouring lengths on logarithmic axes."""
@@ -98,12 +86,10 @@ class EquivalentTime:
 
 @dataclass(frozen=True, eq=False)
 class Measure:
-    """A squared distance between two trajectories, made of sums over blocks of frames.
-
-    `sums` are of (reference, candidate, replicate), `(n_blocks, n_sums)`, the blocks of the first and the last being
-    equal parts of equal lengths in order of time; `squared(p, q)` maps sums `(n, n_sums)` of a trajectory and
-    `(n_sums,)` of the reference to squared distances `(n,)`.
-    """
+    """A squared distance between two trajectories, made of sums over blocks of frames. `sums` are of (reference,
+    candidate, replicate), `(n_blocks, n_sums)`, the first and the last in equal parts of equal lengths in order of
+    time; `squared(p, q)` maps sums `(n, n_sums)` of a trajectory and `(n_sums,)` of the reference to squared distances
+    `(n,)`."""
 
     key: str
     kind: Kind
@@ -123,31 +109,29 @@ class Measure:
 
 
 def errors_by_length(measure: Measure, length_ps: float) -> tuple[FloatArray, FloatArray]:
-    """Return how far parts of the candidate of every length are from the reference: lengths in ps and distances, both
-    `(n,)`, ascending; the candidate is `length_ps` long. As for MD in `equivalent_time_by`: geometric means over the
-    parts.
-    """
+    """Return how far parts of the candidate, `length_ps` long, of every length are from the reference: lengths in ps
+    and distances (geometric means over the parts), both `(n,)`, ascending."""
     own = measure.sums[1]
-    lengths, found = [], []
-    n_each = 1
-    while n_each <= len(own):
-        errors = measure.to_references(_pieces(own, n_each))
-        logs = np.log(errors[np.isfinite(errors) & (errors > 0)])
-        if len(logs):
-            lengths.append(length_ps * n_each / len(own))
-            found.append(math.exp(0.5 * float(logs.mean())))
-        n_each = 2 * n_each if 2 * n_each <= len(own) or n_each == len(own) else len(own)
-    return np.asarray(lengths), np.asarray(found)
+    found = _logs_by_length(len(own), lambda n_each: measure.to_references(_pieces(own, n_each)))
+    errors = [math.exp(0.5 * float(logs.mean())) for _, logs in found]
+    return length_ps / len(own) * np.array([n_each for n_each, _ in found]), np.asarray(errors)
+
+
+def _logs_by_length(n_blocks: int, squared: Callable[[int], FloatArray]) -> list[tuple[int, FloatArray]]:
+    """Return, of pieces of every number of blocks, doubling up to all of them, the logarithms of their squared
+    distances to the reference."""
+    lengths = sorted({*(1 << k for k in range(n_blocks.bit_length())), n_blocks})
+    errors = [squared(n_each) for n_each in lengths]
+    found = [(n, np.log(e[np.isfinite(e) & (e > 0)])) for n, e in zip(lengths, errors, strict=True)]
+    return [(n, logs) for n, logs in found if len(logs)]
 
 
 def distance_to_reference(measure: Measure, seed: int = 0, n_draws: int = 400) -> Estimate:
     """Return the candidate's distance to the reference (the root mean square of those to reference and replicate) with
-    its 95 % interval: block bootstrap of the candidate alone, of the squared distance."""
+    its 95 % interval: block bootstrap of the candidate alone."""
     own = measure.sums[1]
-    value = float(measure.to_references(own.sum(0)[None])[0])
-    squared = estimate(value, measure.own_draws(seed, n_draws), len(own))
-    low, high = (math.sqrt(max(x, 0.0)) if math.isfinite(x) else math.nan for x in (squared.low, squared.high))
-    return Estimate(math.sqrt(value), low, high, (high - low) / (2 * _NORMAL_95), n_blocks=len(own))
+    value = math.sqrt(float(measure.to_references(own.sum(0)[None])[0]))
+    return distance_estimate(value, np.sqrt(measure.own_draws(seed, n_draws)), len(own))
 
 
 def equivalent_time_by(measure: Measure, length_ps: float, seed: int = 0, n_draws: int = 400) -> EquivalentTime | None:
@@ -162,21 +146,18 @@ def equivalent_time_by(measure: Measure, length_ps: float, seed: int = 0, n_draw
     from scipy.optimize import isotonic_regression
 
     first, own, second = measure.sums
-    n_blocks = len(first)
-    lengths, means, scatter, spans, counts = [], [], [], [], []
-    n_each = 1
-    while n_each <= n_blocks:
-        pairs = ((second, first.sum(0)), (first, second.sum(0)))
-        errors = np.concatenate([measure.squared(_pieces(blocks, n_each), reference) for blocks, reference in pairs])
-        logs = np.log(errors[np.isfinite(errors) & (errors > 0)])
-        if len(logs):
-            lengths.append(length_ps * n_each / n_blocks)
-            means.append(float(logs.mean()))
-            scatter.append(float(logs.std(ddof=1)) if len(logs) >= _MANY_PIECES else math.nan)
-            spans.append(np.exp(0.5 * np.quantile(logs, [0.1, 0.9])))
-            # The two trajectories held whole against each other are one number, twice.
-            counts.append(1 if n_each == n_blocks else len(logs))
-        n_each *= 2
+    pairs = ((second, first.sum(0)), (first, second.sum(0)))
+
+    def squared(n_each: int) -> FloatArray:
+        return np.concatenate([measure.squared(_pieces(blocks, n_each), reference) for blocks, reference in pairs])
+
+    found = _logs_by_length(len(first), squared)
+    lengths = [length_ps * n_each / len(first) for n_each, _ in found]
+    means = [float(logs.mean()) for _, logs in found]
+    scatter = [float(logs.std(ddof=1)) if len(logs) >= _MANY_PIECES else math.nan for _, logs in found]
+    spans = [np.exp(0.5 * np.quantile(logs, [0.1, 0.9])) for _, logs in found]
+    # The two trajectories held whole against each other are one number, twice.
+    counts = [1 if n_each == len(first) else len(logs) for n_each, logs in found]
     value = float(measure.to_references(own.sum(0)[None])[0])
     if len(lengths) < 3 or not math.isfinite(value):
         return None
@@ -248,12 +229,8 @@ def headline(
     found: Sequence[EquivalentTime], cost_ratio: Callable[[EquivalentTime], float | None], length_ps: float
 ) -> str:
     """Return 'Equivalent MD time 38 ns [25 ns, 60 ns] by its φ/ψ map, at 1/900 of its cost; by its kinetics 3 ns
-    [...].'
-
-    `cost_ratio(worth)`: the cost of that much MD over that of the share of the candidate which is worth it, None when a
-    cost is unknown; `length_ps`: of the candidate. Where a part of it suffices, that is said and alone charged for.
-    Empty without a measure.
-    """
+    [...].' Empty without a measure. `cost_ratio(found)`: the cost of that much MD over that of the share of the
+    candidate which equals it, None when a cost is unknown; `length_ps`: of the candidate."""
     first = next((w for w in found if w.kind == "distribution"), None)
     if first is None:
         return ""
@@ -297,18 +274,15 @@ def equivalent_time_charts(found: Sequence[EquivalentTime]) -> list[LineChart]:
 
 
 def equivalent_times(
-    reference: Features, candidate: Features, replicate: Features, torsions: Backbone, options: Options
+    reference: Features, candidate: Features, replicate: Features, torsions: Backbone, seed: int = 0
 ) -> tuple[EquivalentTime, ...]:
-    """Return the equivalent MD time by each measure that applies: histograms of the torsions and of TIC 0, bonds,
-    autocorrelation.
-
-    The candidate enters with all its frames; reference and replicate are cut to one length.
-    """
+    """Return the equivalent MD time by each measure that applies: histograms of torsions, autocorrelation. The
+    candidate enters with all its frames; reference and replicate are cut to one length."""
     three = _equal_parts(reference, candidate, replicate)
     if three is None:
         return ()
     length_ps = three[0][0].total_ps
-    found = [equivalent_time_by(m, length_ps, options.seed) for m in _measures(three, torsions, options)]
+    found = [equivalent_time_by(m, length_ps, seed) for m in _measures(three, torsions)]
     return tuple(w for w in found if w is not None)
 
 
@@ -348,36 +322,28 @@ def even_blocks(segment_lengths: Sequence[int], n_blocks: int) -> Blocks:
     return Blocks(tuple(pieces), n_blocks, max(int(np.diff(edges).max()), 1))
 
 
-def _measures(three: Three, torsions: Backbone, options: Options) -> list[Measure]:
-    out = [_joint_measure(three, torsions)] if torsions.residues else []
-    name, columns = _torsion_columns(three[0][0], torsions)
-    if columns:
+def _measures(three: Three, torsions: Backbone) -> list[Measure]:
+    """Return the measure by the φ/ψ map, or by single torsions where there is none, and that by autocorrelation; none
+    where nothing turns."""
+    columns = _torsion_columns(three[0][0], torsions)
+    if not columns:
+        return []
+    if torsions.residues:
+        found = _joint_measure(three, torsions)
+    else:
         counts = [[distributions.block_counts(f.column(*c), TORSION_BINS, b) for f, b in three] for c in columns]
-        out.append(_histogram_measure("torsion_jsd", name, counts))
-        out += _tica_measures(three, options)
-        moving = _correlation_measure(three)
-        out += [moving] if moving is not None else []
-    elif n_bonds := three[0][0].bonds_nm[0].shape[1]:
-        bonds = [[[x[:, k] for x in f.bonds_nm] for f, _ in three] for k in range(n_bonds)]
-        counts = [
-            [distributions.block_counts(x, distributions.normal_bins(of[0]), b) for x, (_, b) in zip(of, three)]
-            for of in bonds
-        ]
-        out.append(_histogram_measure("bond_jsd", "bond lengths", counts))
-    return out
+        found = _histogram_measure("torsion_jsd", "single torsions", counts)
+    moving = _correlation_measure(three)
+    return [found] if moving is None else [found, moving]
 
 
-def _torsion_columns(reference: Features, torsions: Backbone) -> tuple[str, list[tuple[Any, int]]]:
-    """Return what the torsions are called together, and each as the series it is in and its column: phi and psi, or,
-    where there are none, rotatable torsions; rotors of what has nothing else that turns."""
+def _torsion_columns(reference: Features, torsions: Backbone) -> list[tuple[Any, int]]:
+    """Return the series and the column of phi and psi, or, where there are none, of rotatable torsions; of rotors where
+    nothing else turns."""
     backbone = [("phi", k) for k in range(len(torsions.phi))] + [("psi", k) for k in range(len(torsions.psi))]
-    if backbone:
-        return "single φ and ψ", evenly(backbone, MOST_HISTOGRAMS)
     rotors = [k for k, t in enumerate(reference.probes.torsions) if t.kind == "rotor"] if reference.probes else []
-    for chosen, name in ((slow_torsions(reference), "single rotatable torsions"), (rotors, "single rotors")):
-        if chosen:
-            return name, evenly([("torsions", k) for k in chosen], MOST_HISTOGRAMS)
-    return "", []
+    further = [("torsions", k) for k in slow_torsions(reference) or rotors]
+    return evenly(backbone or further, MOST_HISTOGRAMS)
 
 
 def _joint_measure(three: Three, torsions: Backbone) -> Measure:
@@ -386,10 +352,8 @@ def _joint_measure(three: Three, torsions: Backbone) -> Measure:
 
 
 def _histogram_measure(key: str, name: str, counts: Sequence[Sequence[FloatArray]]) -> Measure:
-    """Return the measure whose square is the mean Jensen-Shannon divergence over several histograms.
-
-    `counts`: for each histogram those of (reference, candidate, replicate) per block.
-    """
+    """Return the measure whose square is the mean Jensen-Shannon divergence over several histograms; `counts`: of each
+    those of (reference, candidate, replicate) per block."""
     visited = [sum(c.sum(0) for c in three) > 0 for three in counts]
     kept = [[c[:, v] for c in three] for three, v in zip(counts, visited, strict=True)]
     edges = np.cumsum([int(v.sum()) for v in visited])[:-1]
@@ -402,24 +366,9 @@ def _histogram_measure(key: str, name: str, counts: Sequence[Sequence[FloatArray
     return Measure(key, "distribution", name, (first, own, second), squared)
 
 
-def _tica_measures(three: Three, options: Options) -> list[Measure]:
-    lag = max(1, round(options.tica_lag_ps / three[0][0].lag_ps))
-    features = [tica_features(f) for f, _ in three]
-    model = kinetics.fit_tica(features[0], lag) if max(map(len, features[0])) > 10 * lag else None
-    if model is None:
-        return []
-    projected = [[model.project(x) for x in segments] for segments in features]
-    bins = distributions.reference_bins(projected[0])
-    counts = [distributions.block_counts(x, bins, b) for x, (_, b) in zip(projected, three, strict=True)]
-    return [_histogram_measure("tic0_jsd", "TIC 0", [counts])]
-
-
 def _correlation_measure(three: Three) -> Measure | None:
     """Return the root mean square difference of the autocorrelations of cos psi (of rotatable torsions where there is
-    no psi), at lags even on a log scale.
-
-    Lags run to the first zero crossing of the reference's slowest torsion. None where none moves.
-    """
+    no psi), at lags even on a log scale up to the first zero of the reference's slowest. None where none moves."""
     moving = [turning(f) for f, _ in three]
     chosen = evenly(range(len(moving[0])), MOST_MAPS)
     series = [[m[k][2] for m in moving] for k in chosen]

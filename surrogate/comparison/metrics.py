@@ -4,40 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Protocol
 
 from surrogate.comparison.rows import kinetics_rows, published_metrics, structure_rows, torsion_rows, validity_rows
 from surrogate.comparison.rows.charts import Chart
 from surrogate.comparison.rows.rows import ComparisonInput, Kind, Measured, Row, Skipped, TimeScale, by_group
 
 
-class Metric(Protocol):
-    """A metric of a comparison.
-
-    `kind`: "validity" (of single frames), "distribution", "kinetics", or "information", whose charts are shown and on
-    which no verdict rests. `time_scale`: how soon its quantity has forgotten itself, which says whether a short
-    comparison, or one by a reference that depends on its start, can test it (`verdict.untested`).
-    """
-
-    @property
-    def name(self) -> str:
-        """Name for people."""
-
-    @property
-    def kind(self) -> Kind:
-        """What sort of difference it finds."""
-
-    @property
-    def time_scale(self) -> TimeScale:
-        """Of the slowest motion that its rows depend on."""
-
-    def measure(self, inputs: ComparisonInput) -> Measured:
-        """Return rows of the candidate between reference and replicate, charts, and what was left out and why."""
-
-
 @dataclass(frozen=True)
-class FunctionMetric:
-    """A metric that is a function of the input; see `Metric`."""
+class Metric:
+    """A metric of a comparison: its name for people, its `kind` (charts of "information" are shown, and no verdict
+    rests on it), the `time_scale` of the slowest motion that its rows depend on, which says whether a short comparison,
+    or one by a reference that depends on its start, can test it (`verdict.untested`), and `measure`: rows of the
+    candidate between reference and replicate, charts, and what was left out and why."""
 
     name: str
     kind: Kind
@@ -46,33 +24,25 @@ class FunctionMetric:
 
 
 METRICS: tuple[Metric, ...] = (
-    FunctionMetric("Validity of frames", "validity", "fast", validity_rows.validity_rows),
-    FunctionMetric("Copies of frames", "validity", "fast", validity_rows.copy_rows),
-    FunctionMetric("Bond lengths", "distribution", "fast", structure_rows.bond_rows),
-    FunctionMetric("Bond angles", "distribution", "fast", structure_rows.angle_rows),
-    FunctionMetric("Temperature of vibrations", "distribution", "fast", structure_rows.temperature_rows),
-    FunctionMetric("Potential energies", "distribution", "fast", validity_rows.energy_rows),
-    FunctionMetric("Populations of basins", "distribution", "slow", torsion_rows.population_rows),
-    FunctionMetric("φ and ψ", "distribution", "slow", torsion_rows.torsion_rows),
-    FunctionMetric(
-        "φ and ψ without frames that guards changed", "distribution", "slow", torsion_rows.intervention_rows
-    ),
-    FunctionMetric("Other torsions", "distribution", "slow", torsion_rows.other_torsion_rows),
-    FunctionMetric(
-        "Torsions within the states of slower ones", "distribution", "within states", torsion_rows.within_rows
-    ),
-    FunctionMetric("Size and shape", "distribution", "slow", structure_rows.shape_rows),
-    FunctionMetric("Secondary structure", "distribution", "slow", structure_rows.secondary_structure),
-    FunctionMetric("Contacts", "distribution", "slow", structure_rows.contact_rows),
-    FunctionMetric("Hydrogen bonds", "distribution", "slow", structure_rows.hydrogen_bond_rows),
-    FunctionMetric("Relaxation of torsions", "kinetics", "slow", kinetics_rows.correlation_rows),
-    FunctionMetric("TIC 0", "kinetics", "slow", kinetics_rows.tica_rows),
-    FunctionMetric("Markov state model", "kinetics", "slow", kinetics_rows.msm_rows),
-    FunctionMetric("Steps from frame to frame", "kinetics", "step", torsion_rows.step_rows),
-    FunctionMetric("Steps across chunk boundaries", "kinetics", "fast", kinetics_rows.boundary_row),
-    FunctionMetric("The peptide papers' recipe", "information", "slow", published_metrics.peptide_charts),
-    FunctionMetric("Forecast error", "information", "fast", published_metrics.forecast_charts),
-    FunctionMetric("RMSD and torsions along time", "information", "slow", structure_rows.along_time),
+    Metric("Validity of frames", "validity", "fast", validity_rows.validity_rows),
+    Metric("Copies of frames", "validity", "fast", validity_rows.copy_rows),
+    Metric("Bond lengths", "distribution", "fast", structure_rows.bond_rows),
+    Metric("Bond angles", "distribution", "fast", structure_rows.angle_rows),
+    Metric("Temperature of vibrations", "distribution", "fast", structure_rows.temperature_rows),
+    Metric("Potential energies", "distribution", "fast", validity_rows.energy_rows),
+    Metric("Populations of basins", "distribution", "slow", torsion_rows.population_rows),
+    Metric("φ and ψ", "distribution", "slow", torsion_rows.torsion_rows),
+    Metric("Other torsions", "distribution", "slow", torsion_rows.other_torsion_rows),
+    Metric("Torsions within the states of slower ones", "distribution", "within states", torsion_rows.within_rows),
+    Metric("Size and shape", "distribution", "slow", structure_rows.shape_rows),
+    Metric("Secondary structure", "distribution", "slow", structure_rows.secondary_structure),
+    Metric("Contacts", "distribution", "slow", structure_rows.contact_rows),
+    Metric("Hydrogen bonds", "distribution", "slow", structure_rows.hydrogen_bond_rows),
+    Metric("Relaxation of torsions", "kinetics", "slow", kinetics_rows.correlation_rows),
+    Metric("TIC 0 and Markov state model", "kinetics", "slow", kinetics_rows.slow_rows),
+    Metric("Steps from frame to frame", "kinetics", "step", torsion_rows.step_rows),
+    Metric("Steps across chunk boundaries", "kinetics", "fast", kinetics_rows.boundary_row),
+    Metric("The peptide papers' recipe", "information", "slow", published_metrics.peptide_charts),
 )
 
 

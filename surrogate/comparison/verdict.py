@@ -35,7 +35,6 @@ _WHAT: dict[Group, str] = {
     "distributions": "distributions and free energies of torsions",
     "kinetics": "relaxation times and rates",
 }
-_GOOD, _BAD = ("agrees", "close"), ("differs", "fails")
 
 
 class Cautions(NamedTuple):
@@ -53,8 +52,8 @@ SURE = Cautions()
 
 
 def cautions_of(inputs: ComparisonInput, correlation: float, start: str = "") -> Cautions:
-    """Return which slow motions are not sampled, in words. `correlation`: the slowest of any trajectory, frames;
-    `start`: what of the reference still depends on where it started."""
+    """Return which slow motions are not sampled, in words. `correlation`: the slowest of any, frames; `start`: what of
+    the reference still depends on where it started."""
     short = lost = ""
     samples = effective_samples(round(inputs.compared_ps / inputs.lag_ps), correlation)
     if samples < LEAST_SAMPLES:
@@ -72,12 +71,8 @@ def cautions_of(inputs: ComparisonInput, correlation: float, start: str = "") ->
 
 
 def evaluated_rows(rows: Sequence[Row], options: Options) -> tuple[Row, ...]:
-    """Return the rows with corrected p-values and a word each.
-
-    agrees: no significant difference (5 % over all rows, Holm), and a difference beyond the tolerance would have shown;
-    close: significant, but within the tolerance; differs: significant and beyond it; fails: not computable where the
-    reference is, or a validity check missed tenfold; undecided: the error bars are wider than the tolerance.
-    """
+    """Return the rows with corrected p-values (Holm over all rows) and a word each; what the words mean stands in the
+    report's definitions."""
     corrected = holm([math.nan if r.form == "share" else r.p_value for r in rows])
     evaluated = [
         replace(row, p_corrected=p, verdict=_word(row, p, options.significance))
@@ -98,16 +93,17 @@ def _word(row: Row, p: float, significance: float) -> Word:
     if not math.isfinite(p):
         return "undecided"
     within = _within_tolerance(row)
-    if p < significance and not _beats_replicate(row):
+    # By a distance no greater than the replicate's own nothing is off.
+    beats_replicate = row.form == "distance" and row.ratio is not None and row.ratio.value <= 1.0
+    if p < significance and not beats_replicate:
         return "close" if within else "differs"
     if row.form == "distance":
         return "agrees" if within else "undecided"
-    return "agrees" if _resolution(row) <= row.tolerance else "undecided"
-
-
-def _beats_replicate(row: Row) -> bool:
-    """Whether a distance is no greater than the replicate's own: nothing is off by it."""
-    return row.form == "distance" and row.ratio is not None and row.ratio.value <= 1.0
+    if row.reference is None:
+        return "undecided"
+    # The difference that this much data could just have shown: 1.96 combined standard errors.
+    combined = math.hypot(row.reference.error, row.candidate.error)
+    return "agrees" if 1.96 * combined <= row.tolerance and max(combined, row.tolerance) > 0.0 else "undecided"
 
 
 def _within_tolerance(row: Row) -> bool:
@@ -119,16 +115,6 @@ def _within_tolerance(row: Row) -> bool:
     if row.reference is None:
         return False
     return abs(row.candidate.value - row.reference.value) <= row.tolerance
-
-
-def _resolution(row: Row) -> float:
-    """The difference that this much data could just have shown: 1.96 combined standard errors."""
-    if row.reference is None:
-        return math.nan
-    combined = math.hypot(row.reference.error, row.candidate.error)
-    if combined == 0.0 and row.tolerance == 0.0:
-        return math.inf
-    return 1.96 * combined
 
 
 def _share_word(row: Row) -> Word:
@@ -147,12 +133,9 @@ def _share_word(row: Row) -> Word:
 
 def untested(rows: Sequence[Row], *, start: bool = False) -> list[Row]:
     """Return the rows of a comparison too short to test what follows the slow motion: those rows without a p-value.
-
-    What is left is fast (frames that are no molecule, bonds, angles, steps, what moves within a state). What moves
-    within a state is not, where the reference and its replicate differ by it: there a state they do not share, such as
-    another rotamer beside it, is as good a reason as a wrong. Of a reference that depends on its `start` both share
-    that, and what moves within a state is left out, but for steps from frame to frame.
-    """
+    What moves within a state is left out, too, where reference and replicate differ by it: a state that they do not
+    share is as good a reason as a wrong. Of a reference that depends on its `start` both share that, and only what is
+    fast and steps from frame to frame is tested."""
 
     def tested(row: Row) -> bool:
         if row.time_scale == "slow" or (start and row.time_scale == "within states"):
@@ -217,33 +200,23 @@ def _excess(row: Row) -> float:
 
 def sentence(rows: Sequence[Row], found: Sequence[str], compared: str, cautions: Cautions = SURE) -> str:
     """Return the verdict in one or two sentences; `compared` is the compared length in words."""
-    kind = status(rows, cautions)
-    n = len(rows)
-    undecided = sum(r.verdict == "undecided" for r in rows)
-    worst = "; ".join(found[:_MENTIONED])
+    n, undecided = len(rows), sum(r.verdict == "undecided" for r in rows)
+    close = sum(r.verdict == "close" for r in rows)
     more = f" (and {len(found) - _MENTIONED} more)" if len(found) > _MENTIONED else ""
-    tail = ""
+    worst = f"{'; '.join(found[:_MENTIONED])}{more}"
+    why = "; ".join(filter(None, reversed(cautions))) or "the error bars are wider than the tolerances"
+    said = {
+        "broken": f"Broken: {worst}.",
+        "different": f"Differs from reference MD over {compared}: {worst}.",
+        "close": f"Close to reference MD over {compared}: {close} of {n} metrics measurably off, each within its "
+        f"tolerance: {worst}.",
+        "undecided": f"Undecided over {compared}: {why}." + (f" Significant as it stands: {worst}." if found else ""),
+        "indistinguishable": f"Indistinguishable from reference MD over {compared}: none of {n - undecided} metrics "
+        "differs significantly from it.",
+    }[status(rows, cautions)]
     if undecided:
-        tail = f" {undecided} of {n} metrics cannot be decided: their error bars are wider than the tolerances."
-    if kind == "broken":
-        return f"Broken: {worst}{more}.{tail}"
-    if kind == "different":
-        return f"Differs from reference MD over {compared}: {worst}{more}.{tail}"
-    if kind == "close":
-        n_close = sum(r.verdict == "close" for r in rows)
-        verb = "differs" if n_close == 1 else "differ"
-        return (
-            f"Close to reference MD over {compared}: {n_close} of {n} metrics {verb} measurably, each within its "
-            f"tolerance: {worst}{more}.{tail}"
-        )
-    if kind == "undecided":
-        why = "; ".join(filter(None, reversed(cautions))) or "the error bars are wider than the tolerances"
-        all_the_same = f" Significant as it stands: {worst}{more}." if found else ""
-        return f"Undecided over {compared}: {why}.{all_the_same}{tail}"
-    return (
-        f"Indistinguishable from reference MD over {compared}: none of {n - undecided} metrics differs significantly "
-        f"from it.{tail}"
-    )
+        said += f" {undecided} of {n} metrics cannot be decided: their error bars are wider than the tolerances."
+    return said
 
 
 def in_short(
@@ -251,32 +224,36 @@ def in_short(
 ) -> tuple[str, str, str]:
     """Return the three lines: whether to use the trajectory in place of reference MD, for what, and why."""
     good, bad, unknown = map("; ".join, _sorted(rows))
-    why = "; ".join(findings[:_MENTIONED_WHY])
     for_what = f"Right: {good or 'nothing that could be tested'}."
     for_what += f" Wrong: {bad}." if bad else ""
     for_what += f" Not known: {unknown}." if unknown else ""
-    ends = f" {equivalent_time}" if equivalent_time else ""
+    why = "; ".join(findings[:_MENTIONED_WHY])
     if status == "broken":
         return "Do not use it.", "For nothing: frames are no molecules, or do not move as one.", f"Why: {why}."
+    use = {
+        "undecided": "Not known yet whether it can be used.",
+        "different": "Do not use it for what is wrong in it.",
+        "close": "Use it within its tolerances.",
+    }.get(status, "Use it.")
     if status == "undecided":
-        reason = next(filter(None, reversed(cautions)), "the error bars are wider than what would matter")
-        return "Not known yet whether it can be used.", for_what, f"Why: {reason}.{ends}"
-    if status == "different":
-        waits = f" What is not known waits: {cautions.start}." if cautions.start else ""
-        return "Do not use it for what is wrong in it.", for_what, f"Why: {why}.{waits}{ends}"
-    if status == "close":
-        return "Use it within its tolerances.", for_what, f"Why: {why}, each within its tolerance.{ends}"
-    return "Use it.", for_what, f"Why: nothing measured differs from reference MD by more than chance.{ends}"
+        why = next(filter(None, reversed(cautions)), "the error bars are wider than what would matter")
+    elif status == "different":
+        why += f". What is not known waits: {cautions.start}" if cautions.start else ""
+    else:
+        why = (
+            f"{why}, each within its tolerance"
+            if why
+            else "nothing measured differs from reference MD by more than chance"
+        )
+    return use, for_what, f"Why: {why}. {equivalent_time}".rstrip()
 
 
 def _sorted(rows: Sequence[Row]) -> tuple[list[str], list[str], list[str]]:
     """Return what is right, what is wrong and what is not known, by the words of each group's rows."""
-    good: list[str] = []
-    bad: list[str] = []
-    unknown: list[str] = []
+    found: tuple[list[str], list[str], list[str]] = ([], [], [])
     for group, name in _WHAT.items():
         words = [r.verdict for r in rows if r.group == group and r.key != ALL_KEY]
         if words:
-            right = 2 * sum(w in _GOOD for w in words) >= len(words)
-            (bad if any(w in _BAD for w in words) else good if right else unknown).append(name)
-    return good, bad, unknown
+            right = 2 * sum(w in ("agrees", "close") for w in words) >= len(words)
+            found[1 if {"differs", "fails"} & set(words) else 0 if right else 2].append(name)
+    return found

@@ -60,10 +60,10 @@ def measure(
     occupied = kinetics.state_counts([labels], blocks, len(function))
     part, total = occupied[:, :-1][:, inside].sum(1), occupied.sum(1)
     population = estimate(part.sum() / total.sum(), weights @ part / (weights @ total), blocks.n_blocks)
-    sums = kinetics.function_sums(kinetics.block_transitions([labels], blocks, len(function), lag), function)
+    counts = kinetics.block_transitions([labels], blocks, len(function), lag)
     time = estimate(
-        float(kinetics.timescale(kinetics.lagged_eigenvalue(sums), lag)),
-        kinetics.timescale(kinetics.lagged_eigenvalue(sums, weights), lag),
+        float(kinetics.timescale(kinetics.function_eigenvalue(counts, function), lag)),
+        kinetics.timescale(kinetics.function_eigenvalue(counts, function, weights), lag),
         blocks.n_blocks,
         log=True,
     )

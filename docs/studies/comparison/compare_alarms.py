@@ -76,9 +76,7 @@ def cut(runs: Sequence[Ensemble], piece_ps: float) -> list[tuple[int, Ensemble]]
             for start in range(0, len(segment) - n + 1, n):
                 name = f"{run.label} {s} at {format_time_ps(start * run.lag_ps)}"
                 frames = segment[start : start + n]
-                piece = replace(
-                    run, label=name, segments=[frames], flags=None, chunk_idx=None, changed=None, sources=()
-                )
+                piece = replace(run, label=name, segments=[frames], flags=None, chunk_idx=None, sources=())
                 out.append((k, piece))
     return out
 

@@ -207,7 +207,6 @@ def stretch(ensemble: Ensemble, first: int, last: int | None) -> Ensemble:
         segments=[np.asarray(s[first:last]) for s in ensemble.segments],
         flags=None if ensemble.flags is None else [f[first:last] for f in ensemble.flags],
         chunk_idx=None if ensemble.chunk_idx is None else [c[first:last] for c in ensemble.chunk_idx],
-        changed=None if ensemble.changed is None else [c[first:last] for c in ensemble.changed],
     )
 
 

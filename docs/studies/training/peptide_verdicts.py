@@ -15,7 +15,6 @@ if TYPE_CHECKING:
 
 # Rows of the comparison that the table shows, by their keys, in their units.
 ROWS = {
-    "tic0_timescale": "TIC 0, ps",
     "msm_timescale": "slowest process of the MSM, ps",
     "msm_jsd": "MSM populations, distance",
     "valid:all": "valid, %",

@@ -57,10 +57,8 @@ def _finite_values(segments: Sequence[AnyFloat]) -> FloatArray:
 
 
 def reference_bins(segments: Sequence[AnyFloat], n: int = 100) -> Bins:
-    """Return bins over the finite values of the reference, from its least to its greatest and 5 % beyond.
-
-    Without the margin the reference alone would have nothing outside its range, and any replicate would stand out.
-    """
+    """Return bins over the finite values of the reference, from its least to its greatest and 5 % beyond: without that
+    the reference alone would have nothing outside its range, and any replicate would stand out."""
     values = _finite_values(segments)
     if not len(values):
         return Bins(0.0, 1.0, n)
@@ -70,10 +68,8 @@ def reference_bins(segments: Sequence[AnyFloat], n: int = 100) -> Bins:
 
 
 def normal_bins(segments: Sequence[AnyFloat], n: int = 100) -> Bins:
-    """Return bins over four standard deviations on either side of the mean of the reference's finite values.
-
-    For quantities that vibrate about one value: a few outliers in the reference do not widen the bins.
-    """
+    """Return bins over four standard deviations on either side of the mean of the reference's finite values, for what
+    vibrates about one value: a few outliers do not widen the bins."""
     values = _finite_values(segments)
     if not len(values):
         return Bins(0.0, 1.0, n)
@@ -143,10 +139,8 @@ def is_positive(phi_rad: AnyFloat) -> BoolArray:
 
 
 def block_occupancy(member: Sequence[BoolArray], blocks: Blocks) -> tuple[FloatArray, FloatArray]:
-    """Return per block how many frames are in the basin and how many there are: two `(n_blocks,)` arrays.
-
-    Frames that are not finite are members of nothing and stay in the denominator.
-    """
+    """Return per block how many frames are in the basin and how many there are, two `(n_blocks,)` arrays; frames that
+    are not finite are members of nothing and stay in the denominator."""
     counts = count_in_blocks([m.astype(np.int64) for m in member], 2, blocks)
     return counts[:, 1], counts.sum(axis=1)
 

@@ -30,10 +30,8 @@ _CLUSTERED_FRAMES = 10_000
 
 @dataclass(frozen=True, eq=False)
 class LagSums:
-    """Sums over pairs (t, t + lag) that start in a block, each `(n_blocks, n_lags)`, lag 0 first.
-
-    `xy`: products, `head` and `tail`: the first and the second factor alone, `n`: how many pairs.
-    """
+    """Sums over pairs (t, t + lag) that start in a block, each `(n_blocks, n_lags)`, lag 0 first: products, first and
+    second factor alone, how many pairs."""
 
     xy: FloatArray
     head: FloatArray
@@ -128,45 +126,6 @@ def zero_crossing(segments: Sequence[AnyFloat]) -> tuple[int, float]:
         n_lags = min(ceiling, n_lags * 8)
 
 
-@dataclass(frozen=True, eq=False)
-class PairSums:
-    """Per block `(n_blocks,)`, over pairs at one lag: products, sum and sum of squares of both ends, pairs."""
-
-    products: FloatArray
-    ends: FloatArray
-    squares: FloatArray
-    n: FloatArray
-
-
-def pair_sums(segments: Sequence[AnyFloat], blocks: Blocks, lag: int) -> PairSums:
-    """Return the sums over pairs `lag` frames apart that `lagged_eigenvalue` needs."""
-    out = np.zeros((4, blocks.n_blocks))
-    for piece in blocks.pieces:
-        series = np.asarray(segments[piece.segment], dtype=np.float64)
-        x = series[piece.start : min(piece.stop, max(len(series) - lag, 0))]
-        y = series[piece.start + lag : piece.start + lag + len(x)]
-        ok = np.isfinite(x) & np.isfinite(y)
-        x, y = x[ok], y[ok]
-        out[:, piece.block] += np.array([x @ y, (x + y).sum(), x @ x + y @ y, len(x)])
-    return PairSums(*out)
-
-
-def lagged_eigenvalue(sums: PairSums, weights: FloatArray | None = None) -> FloatArray:
-    """Return the time-symmetrised autocorrelation at one lag, 0-d, or `(n_draws,)` for weights `(n_draws, n_blocks)`.
-
-    2 S_xy / (S_xx + S_yy) with the mean of both ends removed: on the series that TICA was fitted to this is TICA's own
-    eigenvalue (reversible estimator), so every trajectory is measured with the same rule.
-    """
-    w = np.ones((1, len(sums.n))) if weights is None else weights
-    n, products, ends, squares = (w @ a for a in (sums.n, sums.products, sums.ends, sums.squares))
-    with np.errstate(invalid="ignore", divide="ignore"):
-        mean = ends / (2 * n)
-        covariance = products / n - mean**2
-        variance = squares / (2 * n) - mean**2
-        out = np.where(variance > 1e-12 * (mean**2 + squares / n), covariance / variance, np.nan)
-    return np.asarray(out[0] if weights is None else out)
-
-
 def timescale(eigenvalue: npt.ArrayLike, lag: float) -> FloatArray:
     """Return -lag / ln(eigenvalue), in the unit of `lag`; 0 for an eigenvalue of at most 0 (gone within one lag)."""
     value = np.asarray(eigenvalue, dtype=np.float64)
@@ -176,12 +135,10 @@ def timescale(eigenvalue: npt.ArrayLike, lag: float) -> FloatArray:
 
 
 def noise_timescale(n_parameters: int, lag: float, n_frames: float) -> float:
-    """Return the timescale, in the unit of `lag`, that a process found among so many parameters has by chance.
-
-    `lag` and `n_frames` in frames. The greatest eigenvalue of noise goes with the root of parameters over independent
-    pairs (Marchenko and Pastur); half of it is a choice, made on replicas of rigid molecules. Infinite: no process can
-    be told from noise.
-    """
+    """Return the timescale, in the unit of `lag`, that a process found among so many parameters has by chance; infinite
+    where every process may be noise. `lag` and `n_frames` in frames. The greatest eigenvalue of noise goes with the
+    root of parameters over independent pairs (Marchenko and Pastur); half of it is a choice, made on replicas of rigid
+    molecules."""
     eigenvalue = 0.5 * math.sqrt(n_parameters * lag / max(n_frames, 1.0))
     return math.inf if eigenvalue >= 1.0 else float(timescale(eigenvalue, lag))
 
@@ -200,7 +157,7 @@ def circular_mean(angles_rad: AnyFloat) -> float:
 
 @dataclass(frozen=True, eq=False)
 class Projection:
-    """Slow coordinates of the reference: features `(n, k)` less `mean`, times `matrix` `(k,)` or `(k, n_dimensions)`;
+    """Slow coordinates of the reference: features `(n, k)` less `mean`, times `matrix` `(k, n_dimensions)`;
     `eigenvalues` `(n_dimensions,)` at the lag of the fit."""
 
     mean: FloatArray
@@ -208,14 +165,21 @@ class Projection:
     eigenvalues: FloatArray
 
     def project(self, features: AnyFloat) -> FloatArray:
-        """Return coordinates `(n,)` or `(n, n_dimensions)`; NaN where a feature is not finite."""
+        """Return coordinates `(n, n_dimensions)`; NaN where a feature is not finite."""
         with np.errstate(invalid="ignore"):
             return np.asarray((np.asarray(features, dtype=np.float64) - self.mean) @ self.matrix)
 
 
-def _tica(segments: Sequence[FloatArray], lag_frames: int, dim: int) -> tuple[Any, list[FloatArray]] | None:
-    """Return deeptime's TICA (reversible, mean removed) of features `(n_frames, n_features)` and the runs of finite
-    frames it was fitted to; None where nothing varies, or frames are so few that any noise has a slow combination."""
+def fit_projection(
+    segments: Sequence[FloatArray], lag_frames: int, dim: int = MAX_DIMENSIONS, *, least: float = 0.01
+) -> Projection | None:
+    """Return deeptime's TICA (reversible, mean removed) of features `(n, k)`, scaled as a kinetic map; None where
+    nothing varies, or frames are so few that any noise has a slow combination.
+
+    At most `dim` coordinates are kept, those whose eigenvalue exceeds `least` and in any case the first. The rare side
+    of each is positive. Sources: Perez-Hernandez et al., J. Chem. Phys. 139, 015102 (2013); Noe and Clementi, J. Chem.
+    Theory Comput. 11, 5002 (2015).
+    """
     from deeptime.decomposition import TICA
 
     runs = [run for s in segments for run in finite_runs(s) if len(run) > lag_frames and run.shape[1]]
@@ -226,44 +190,15 @@ def _tica(segments: Sequence[FloatArray], lag_frames: int, dim: int) -> tuple[An
     covariance = TICA.covariance_estimator(lagtime=lag_frames)
     for run in runs:
         covariance.partial_fit((run[:-lag_frames], run[lag_frames:]))
-    return TICA(lagtime=lag_frames, dim=dim).fit_from_covariances(covariance).fetch_model(), runs
-
-
-def fit_tica(segments: Sequence[FloatArray], lag_frames: int) -> Projection | None:
-    """Return TIC 0 of features `(n_frames, n_features)`, `matrix` `(n_features,)`; None as in `_tica`.
-
-    Its sign is chosen so that its skewness is positive: the rare state lies on the right. Source: Perez-Hernandez et
-    al., J. Chem. Phys. 139, 015102 (2013).
-    """
-    fitted = _tica(segments, lag_frames, 1)
-    if fitted is None:
-        return None
-    model, runs = fitted
-    vector = np.real(np.asarray(model.singular_vectors_left)[:, 0]).astype(np.float64)
-    mean = np.asarray(model.mean_0, dtype=np.float64)
-    projected = np.concatenate([(run - mean) @ vector for run in runs])
-    if float(((projected - projected.mean()) ** 3).sum()) < 0:
-        vector = -vector
-    return Projection(mean, vector, np.real(np.asarray(model.singular_values))[:1])
-
-
-def fit_projection(
-    segments: Sequence[FloatArray], lag_frames: int, dim: int = MAX_DIMENSIONS, *, least: float = 0.01
-) -> Projection | None:
-    """Return the slow coordinates of features `(n, k)`, scaled as a kinetic map; None as in `_tica`.
-
-    At most `dim` are kept, those whose eigenvalue exceeds `least` and in any case the first. Source: Noe and Clementi,
-    J. Chem. Theory Comput. 11, 5002 (2015): coordinates are scaled by their eigenvalues.
-    """
-    fitted = _tica(segments, lag_frames, dim)
-    if fitted is None:
-        return None
-    model, _ = fitted
+    model = TICA(lagtime=lag_frames, dim=dim).fit_from_covariances(covariance).fetch_model()
     values = np.real(np.asarray(model.singular_values))[:dim]
-    vectors = np.real(np.asarray(model.singular_vectors_left))[:, : len(values)]
     kept = max(int((values > least).sum()), 1)
-    matrix = vectors[:, :kept] * np.clip(np.abs(values[:kept]), 1e-6, 1.0)
-    return Projection(np.asarray(model.mean_0, dtype=np.float64), matrix, values[:kept])
+    vectors = np.real(np.asarray(model.singular_vectors_left))[:, :kept]
+    matrix = vectors * np.clip(np.abs(values[:kept]), 1e-6, 1.0)
+    found = Projection(np.asarray(model.mean_0, dtype=np.float64), matrix, values[:kept])
+    projected = np.concatenate([found.project(run) for run in runs])
+    skewness = ((projected - projected.mean(axis=0)) ** 3).sum(axis=0)
+    return Projection(found.mean, np.where(skewness < 0, -matrix, matrix), found.eigenvalues)
 
 
 def finite_runs(features: FloatArray) -> list[FloatArray]:
@@ -368,10 +303,8 @@ def state_counts(labels: Sequence[IntArray], blocks: Blocks, n_states: int) -> F
 
 
 def block_transitions(labels: Sequence[IntArray], blocks: Blocks, n_states: int, lag: int) -> FloatArray:
-    """Return the transition counts of each block at `lag` frames, `(n_blocks, n_states ** 2)`, row-major (from, to).
-
-    A pair belongs to the block in which it starts; pairs with a frame that has no state do not count.
-    """
+    """Return the transition counts of each block at `lag` frames, `(n_blocks, n_states ** 2)`, row-major (from, to). A
+    pair belongs to the block in which it starts; pairs with a frame that has no state do not count."""
     out = np.zeros((blocks.n_blocks, n_states * n_states))
     for piece in blocks.pieces:
         series = labels[piece.segment]
@@ -384,11 +317,9 @@ def block_transitions(labels: Sequence[IntArray], blocks: Blocks, n_states: int,
 
 
 def slow_functions(counts: FloatArray, n_slow: int) -> tuple[FloatArray, FloatArray]:
-    """Return the `n_slow` eigenvalues next to 1, descending, and eigenfunctions `(n_slow, n)` of counts `(n, n)`.
-
-    They are those of the transition matrix with every pair counted in both directions, which imposes detailed balance
-    and is exact for long equilibrium trajectories. States without counts have the value 0.
-    """
+    """Return the `n_slow` eigenvalues next to 1, descending, and eigenfunctions `(n_slow, n)` of counts `(n, n)` with
+    every pair counted in both directions (detailed balance; exact for long equilibrium trajectories). States without
+    counts have the value 0."""
     both = counts + counts.T
     weight = both.sum(1)
     scale = np.where(weight > 0, 1.0 / np.sqrt(np.maximum(weight, 1e-300)), 0.0)
@@ -397,25 +328,20 @@ def slow_functions(counts: FloatArray, n_slow: int) -> tuple[FloatArray, FloatAr
     return values[order], (scale[:, None] * vectors[:, order]).T
 
 
-def function_sums(counts: FloatArray, function: FloatArray) -> PairSums:
-    """Return the pair sums of a function `(n,)` of the state, from transition counts per block `(n_blocks, n ** 2)`.
+def function_eigenvalue(counts: FloatArray, function: FloatArray, weights: FloatArray | None = None) -> FloatArray:
+    """Return the eigenvalue by which a function `(n,)` of the state decays, from transition counts per block
+    `(n_blocks, n ** 2)`: 0-d, or `(n_draws,)` for weights `(n_draws, n_blocks)`.
 
-    `lagged_eigenvalue` of them is the eigenvalue by which this function decays in that trajectory: of the counts it was
-    fitted to, the eigenvalue itself; of any other, that of the same process.
+    Its time-symmetrised autocorrelation, 2 S_xy / (S_xx + S_yy) with the mean of both ends removed: of the counts it
+    was fitted to the eigenvalue itself, so that every trajectory is measured with the same rule.
     """
     head, tail = np.repeat(function, len(function)), np.tile(function, len(function))
+    w = np.ones((1, len(counts))) if weights is None else weights
     parts = (head * tail, head + tail, head**2 + tail**2, np.ones(len(head)))
-    return PairSums(*(counts @ part for part in parts))
-
-
-def chapman_kolmogorov(counts: Sequence[FloatArray]) -> tuple[FloatArray, FloatArray]:
-    """Return predicted and estimated probabilities to be in the state one started in, `(n_lags, n_states)` each.
-
-    `counts[i]`: transition counts `(n, n)` at `(i + 1)` times the lag; NaN for a state without any. The prediction is
-    the power of the first. Source: Prinz et al., J. Chem. Phys. 134, 174105 (2011), eq. 35.
-    """
+    products, ends, squares, n = (w @ (counts @ part) for part in parts)
     with np.errstate(invalid="ignore", divide="ignore"):
-        matrices = [c / c.sum(-1, keepdims=True) for c in counts]
-    first = np.nan_to_num(matrices[0])
-    predicted = [np.diag(np.linalg.matrix_power(first, i + 1)) for i in range(len(counts))]
-    return np.array(predicted), np.array([np.diag(m) for m in matrices])
+        mean = ends / (2 * n)
+        covariance = products / n - mean**2
+        variance = squares / (2 * n) - mean**2
+        out = np.where(variance > 1e-12 * (mean**2 + squares / n), covariance / variance, np.nan)
+    return np.asarray(out[0] if weights is None else out)

@@ -30,11 +30,9 @@ _ROOM = 4.0
 
 @dataclass(frozen=True, eq=False)
 class Clip:
-    """Frames of both trajectories at the same times: `time_ps (n,)`, coordinates `(n, n_shown, 3)` int16.
-
-    A coordinate is `value * Movie.scale_nm`; NOT_FINITE marks a frame that cannot be drawn. `*_flags (n,)` are validity
-    bits; `chunk_idx (n,)` is the candidate's chunk, None where its file marks none.
-    """
+    """Frames of both trajectories at the same times: `time_ps (n,)`, coordinates `(n, n_shown, 3)` int16 in units of
+    `Movie.scale_nm`, NOT_FINITE for a frame that cannot be drawn; validity flags `(n,)`; the candidate's chunk `(n,)`,
+    None where its file marks none."""
 
     name: str
     time_ps: FloatArray
@@ -60,10 +58,8 @@ class Clip:
 
 @dataclass(frozen=True, eq=False)
 class Movie:
-    """Clips of one candidate beside the reference: the atoms shown (`elements`, names) and the bonds among them.
-
-    `bonds (n_bonds, 2)` count within the shown atoms; `scale_nm` is nm per unit of the clips' coordinates.
-    """
+    """Clips of one candidate beside the reference: the elements shown, the bonds among them `(n_bonds, 2)`, nm per unit
+    of the clips' coordinates."""
 
     elements: tuple[str, ...]
     bonds: IntArray
@@ -87,10 +83,8 @@ def make_movie(
     reference: Ensemble, candidate: Ensemble, reference_features: Features, candidate_features: Features, n_frames: int
 ) -> Movie:
     """Return the movie of the first `n_frames` of both: a clip over the whole length, and one of consecutive frames.
-
-    Every frame is laid over the reference's first finite one by its heavy atoms (all atoms where fewer than three are
-    heavy), which is turned so that its longest axis lies across the picture. Hydrogens are left out above 300 atoms.
-    """
+    Every frame is laid over the reference's first finite one by its heavy atoms (all where fewer than three are heavy),
+    which is turned so that its longest axis lies across the picture. Hydrogens are left out above 300 atoms."""
     scene = reference.scene
     every, heavy = np.arange(scene.n_atoms), scene.heavy_idx
     shown = every if scene.n_atoms <= HYDROGENS_UP_TO else heavy
@@ -118,10 +112,8 @@ def make_movie(
 
 
 def pick_frames(segments: Sequence[Any], idx: IntArray) -> Frames:
-    """Return frames `idx` (sorted, counted through the segments in order) as `(len(idx), n_atoms, 3)` nm.
-
-    Consecutive frames are read at once, so that segments may lie in a file.
-    """
+    """Return frames `idx` (sorted, counted through the segments in order) as `(len(idx), n_atoms, 3)` nm; consecutive
+    frames are read at once, so that segments may lie in a file."""
     starts = np.concatenate([[0], np.cumsum([len(s) for s in segments])])
     of_segment = np.searchsorted(starts, idx, side="right") - 1
     breaks = np.flatnonzero((np.diff(idx) != 1) | (np.diff(of_segment) != 0)) + 1

@@ -29,12 +29,9 @@ SLOW_KINDS = ("χ", "rotatable")
 
 
 def longest_correlation(*features: Features) -> float:
-    """Return the longest integrated autocorrelation time, in frames, of all trajectories about their common mean.
-
-    Looked for among cos and sin of every torsion, phi > 0, ring puckers, size and shape, and the slowest combination of
-    torsions (TICA). Trajectories that stay in different states share a mean that neither returns to: such a motion is
-    as long as they are. 1 where nothing moves.
-    """
+    """Return the longest integrated autocorrelation time, in frames, of all trajectories about their common mean, among
+    cos and sin of every torsion, phi > 0, size and shape, and TIC 0; 1 where nothing moves. Trajectories that stay in
+    different states share a mean that neither returns to: such a motion is as long as they are."""
     chosen = _slowest(list(_all_series(features)))
     slowest = tic_0(features)
     times = [kinetics.zero_crossing(s)[1] for s in (*chosen, *([] if slowest is None else [slowest]))]
@@ -61,23 +58,20 @@ def rarely_crossed(references: Sequence[Features], candidate: Features) -> list[
 
 
 def angles_of(features: Sequence[Features], torsions: Backbone | None = None) -> list[tuple[str, Segments]]:
-    """Return every torsion and ring pucker: its name and its values in rad `(n,)` per segment of all trajectories.
-
-    `torsions`: by which φ and ψ are named; by their number where None.
-    """
-    first, probes = features[0], features[0].probes
-    count = [str(k + 1) for k in range(max(first.phi[0].shape[1], first.psi[0].shape[1]))]
+    """Return every torsion: its name and its values in rad `(n,)` per segment of all trajectories. `torsions`: by which
+    φ and ψ are named; by their number where None."""
+    first = features[0]
+    n_phi, n_psi = first.phi[0].shape[1], first.psi[0].shape[1]
+    count = [str(k + 1) for k in range(max(n_phi, n_psi))]
     phi, psi = (torsions.phi_labels, torsions.psi_labels) if torsions else (count, count)
-    families: list[tuple[Any, Sequence[str], int, int]] = [
-        ("phi", [f"φ {x}" for x in phi[: first.phi[0].shape[1]]], 0, 1),
-        ("psi", [f"ψ {x}" for x in psi[: first.psi[0].shape[1]]], 0, 1),
+    families: list[tuple[Any, Sequence[str]]] = [
+        ("phi", [f"φ {x}" for x in phi[:n_phi]]),
+        ("psi", [f"ψ {x}" for x in psi[:n_psi]]),
+        ("torsions", first.probes.labels("torsions") if first.probes else []),
     ]
-    if probes is not None:
-        # Of a ring: its amplitude, then its angle.
-        families += [("torsions", probes.labels("torsions"), 0, 1), ("puckers", probes.labels("puckers")[1::2], 1, 2)]
     return [
-        (name, [x for f in features for x in f.column(family, start + step * k)])
-        for family, names, start, step in families
+        (name, [x for f in features for x in f.column(family, k)])
+        for family, names in families
         for k, name in enumerate(names)
     ]
 
@@ -151,8 +145,8 @@ def tic_0(features: Sequence[Features]) -> list[FloatArray] | None:
     n_frames = sum(map(len, parts))
     if not n_features or n_frames < _FRAMES_A_FEATURE * n_features or max(map(len, parts)) < 10 * lag:
         return None
-    model = kinetics.fit_tica(parts, lag)
-    return None if model is None else [model.project(x) for x in parts]
+    model = kinetics.fit_projection(parts, lag, 1)
+    return None if model is None else [model.project(x)[:, 0] for x in parts]
 
 
 def slow_torsions(features: Features) -> list[int]:
@@ -161,10 +155,8 @@ def slow_torsions(features: Features) -> list[int]:
 
 
 def tica_features(features: Features) -> list[FloatArray]:
-    """Return cos and sin of phi, psi, chi and every other rotatable torsion, `(n_frames, k)` per segment.
-
-    Amide bonds and rotors (methyl and the like) are left out: what turns them is not the slow motion looked for.
-    """
+    """Return cos and sin of phi, psi, chi and every other rotatable torsion, `(n_frames, k)` per segment; amide bonds
+    and rotors turn otherwise than slowly."""
     slow = slow_torsions(features)
     out = []
     for i, (phi, psi) in enumerate(zip(features.phi, features.psi, strict=True)):

@@ -79,10 +79,8 @@ def block_length(n_frames: int, correlation_frames: float) -> int:
 
 
 def make_blocks(segment_lengths: Sequence[int], n_frames_each: int) -> Blocks:
-    """Divide segments into blocks of about `n_frames_each` frames.
-
-    A long segment is cut evenly; segments shorter than a block are gathered whole. No piece crosses a segment.
-    """
+    """Divide segments into blocks of about `n_frames_each` frames: a long segment is cut evenly, segments shorter than
+    a block are gathered whole. No piece crosses a segment."""
     pieces: list[Piece] = []
     block, gathered = 0, 0
     for segment, n in enumerate(segment_lengths):

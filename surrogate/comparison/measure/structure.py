@@ -19,7 +19,7 @@ from surrogate.comparison.measure.torsions import Torsion, find_torsions, residu
 from surrogate.comparison.read.ensemble import Ensemble, Flags, InSegments
 from systems.chemistry.geometry import bond_angle, column_blocks, squared_distance, superpose, torsion_angle
 from systems.chemistry.graph import atom_classes, backbone_torsions, bonded_graph, exclusions
-from systems.chemistry.validity import Geometry, check_frames, geometry_from_frames, small_rings
+from systems.chemistry.validity import Geometry, check_frames, geometry_from_frames
 from systems.scene import Scene
 
 Series = npt.NDArray[np.float32]
@@ -27,7 +27,7 @@ Groups = Sequence[npt.NDArray[np.intp]]
 T = TypeVar("T")
 
 # The columns of each family, `(n_frames, n_columns)`; see `Probes`.
-Family = Literal["torsions", "angles", "shape", "deviation", "contacts", "hydrogen_bonds", "puckers", "secondary"]
+Family = Literal["torsions", "angles", "shape", "deviation", "contacts", "hydrogen_bonds", "secondary"]
 
 _BLOCK_FRAMES = 2048
 _BLOCK_VALUES = 20_000_000
@@ -39,7 +39,6 @@ _ATOM_CONTACT_NM, _RESIDUE_CONTACT_NM = 0.45, 0.8
 MAX_COLUMNS = 256
 _MANY_RESIDUES = 5
 _MANY_ATOMS = 100
-_FLAT_RING_NM = 0.01
 _ROUNDS = 5
 _BACKBONE = ("N", "CA", "C", "O", "OXT")
 _HYDROGEN_BOND_NM, _HYDROGEN_BOND_COSINE = 0.25, -0.5
@@ -70,10 +69,8 @@ class Backbone:
 
 
 def backbone(scene: Scene, kept: IntArray | None = None) -> Backbone:
-    """Return the backbone torsions of `scene`, found in its bond graph, with labels such as 'ALA 2'.
-
-    With `kept`, the atoms of `scene` that are left, those torsions whose atoms all are, counted among them.
-    """
+    """Return the backbone torsions of `scene`, found in its bond graph, with labels such as 'ALA 2'; with `kept`, the
+    atoms of `scene` that are left, those whose atoms all are, counted among them."""
     phi, psi = (np.asarray(backbone_torsions(scene)[x], dtype=np.int64).reshape(-1, 4) for x in ("phi", "psi"))
     if kept is not None:
         phi, psi = (rows[np.isin(rows, kept).all(axis=1)] for rows in (phi, psi))
@@ -91,38 +88,19 @@ def backbone(scene: Scene, kept: IntArray | None = None) -> Backbone:
 
 
 @dataclass(frozen=True, eq=False)
-class Chains:
-    """The backbone of every amino acid: atoms N, CA, C, O `(n_residues, 4)`, in order along the chains.
-
-    `chain` `(n_residues,)` counts the chains, `is_proline` `(n_residues,)` marks those without a hydrogen on N, and
-    `labels` are such as 'ALA 2'.
-    """
-
-    atoms: IntArray
-    chain: IntArray
-    is_proline: BoolArray
-    labels: tuple[str, ...]
-
-
-NO_CHAINS = Chains(np.empty((0, 4), np.int64), np.empty(0, np.int64), np.empty(0, bool), ())
-
-
-@dataclass(frozen=True, eq=False)
 class Probes:
     """What every frame is measured for, beside phi, psi, bonds and validity. Families and their columns:
 
-    "torsions" `(n, len(torsions))` rad, folded (m times the angle, on [-pi, pi]); "angles" `(n, n_angles)` rad;
-    "shape" `(n, 5)`: radius of gyration, RMSD, end-to-end distance (nm), contacts formed, share of the reference's
-    contacts kept; "deviation" `(n, n_fit)` squared distance in nm² of each fitted atom from the reference's mean
-    structure; "contacts" and "hydrogen_bonds" `(n, k)` bool; "puckers" `(n, 2 n_rings)`: amplitude nm, angle rad;
-    "secondary" `(n, n_residues)` int8, the structure of each residue (`secondary_structure`). A frame that is
-    not finite has NaN, False in the families of bool, and coil.
+    "torsions" `(n, len(torsions))` rad, folded (m times the angle, on [-pi, pi]); "angles" `(n, n_angles)` rad; "shape"
+    `(n, 5)`: radius of gyration, RMSD, end-to-end distance (nm), contacts formed, share of the reference's contacts
+    kept; "deviation" `(n, n_fit)` squared distance in nm² of each fitted atom from the reference's mean structure;
+    "contacts" and "hydrogen_bonds" `(n, k)` bool; "secondary" `(n, n_residues)` int8, the structure of each amino acid
+    in `chains`. A frame that is not finite has NaN, False in the families of bool, and coil.
 
     `all_contacts` are the pairs counted in "shape", `contacts` and `hydrogen_bonds` those with a column of their own
-    (all, or the `MAX_COLUMNS` that the reference forms most evenly or most often). `native` are the contacts that the
-    reference forms in more than half of its frames. `classes` `(n_atoms,)`: equal for atoms without an identity of
-    their own, such as the hydrogens of a methyl group; what they make equal is chosen together. `left_out` says what is
-    not measured, and why; `whole` is False where atoms of the scene are missing.
+    (all, or the `MAX_COLUMNS` that the reference forms most evenly or most often), `native` those that it forms in more
+    than half of its frames. `classes` `(n_atoms,)`: equal for atoms without an identity of their own, such as the
+    hydrogens of a methyl group; what they make equal is chosen together. `left_out` says what is not measured, and why.
     """
 
     scene: Scene
@@ -136,33 +114,26 @@ class Probes:
     contacts: IntArray
     native: IntArray
     hydrogen_bonds: IntArray
-    rings: tuple[tuple[int, ...], ...]
     classes: IntArray
-    chains: Chains = NO_CHAINS
+    chains: IntArray = field(default_factory=lambda: np.empty((0, 4), np.int64))
     left_out: tuple[tuple[str, str], ...] = ()
-    whole: bool = True
 
     def labels(self, family: Family) -> list[str]:
         """Return a name per column of a family."""
-        names, scene = self.scene.atom_names, self.scene
 
-        def placed(atom: int) -> str:
-            return f"{names[atom]} ({residue_label(scene, atom)})"
+        def joined(*atoms: int, of: int = 0) -> str:
+            names = "-".join(self.scene.atom_names[i] for i in atoms)
+            return f"{names} ({residue_label(self.scene, atoms[of])})"
 
-        def joined(atoms: Sequence[int], of: int = 0) -> str:
-            return f"{'-'.join(names[i] for i in atoms)} ({residue_label(scene, atoms[of])})"
-
-        made: dict[Family, Callable[[], list[str]]] = {
-            "torsions": lambda: [t.label for t in self.torsions],
-            "angles": lambda: [joined(row, 1) for row in self.angles.tolist()],
-            "shape": lambda: ["radius of gyration", "RMSD", "end-to-end distance", "contacts", "contacts kept"],
-            "deviation": lambda: [placed(i) for i in self.fit_idx.tolist()],
-            "contacts": lambda: [f"{placed(i)} ... {placed(j)}" for i, j in self.contacts.tolist()],
-            "hydrogen_bonds": lambda: [f"{joined((d, h))} ... {placed(a)}" for d, h, a in self.hydrogen_bonds.tolist()],
-            "puckers": lambda: [f"{what}, ring {joined(r)}" for r in self.rings for what in ("amplitude", "angle")],
-            "secondary": lambda: list(self.chains.labels),
+        made: dict[str, list[str]] = {
+            "torsions": [t.label for t in self.torsions],
+            "angles": [joined(*row, of=1) for row in self.angles.tolist()],
+            "deviation": [joined(i) for i in self.fit_idx.tolist()],
+            "contacts": [f"{joined(i)} ... {joined(j)}" for i, j in self.contacts.tolist()],
+            "hydrogen_bonds": [f"{joined(d, h)} ... {joined(a)}" for d, h, a in self.hydrogen_bonds.tolist()],
+            "secondary": [residue_label(self.scene, row[1]) for row in self.chains.tolist()],
         }
-        return made[family]()
+        return made[family]
 
     def measure(self, frames_nm: Series) -> dict[Family, npt.NDArray[Any]]:
         """Return every family for frames `(n, n_atoms, 3)` nm."""
@@ -174,8 +145,7 @@ class Probes:
             "deviation": np.empty((n, len(self.fit_idx)), dtype=np.float32),
             "contacts": np.zeros((n, len(self.contacts)), dtype=bool),
             "hydrogen_bonds": np.zeros((n, len(self.hydrogen_bonds)), dtype=bool),
-            "puckers": np.empty((n, 2 * len(self.rings)), dtype=np.float32),
-            "secondary": secondary_structure(frames_nm, self.chains),
+            "secondary": secondary_structure(frames_nm, self.scene, self.chains),
         }
         quads = np.array([q for t in self.torsions for q in t.equal or (t.quad,)], dtype=np.int64).reshape(-1, 4)
         of_torsion = np.repeat(np.arange(len(self.torsions)), [len(t.equal) or 1 for t in self.torsions])
@@ -201,8 +171,6 @@ class Probes:
                 out["shape"][part, 3] = near.sum(axis=0)
                 if len(self.native):
                     out["shape"][part, 4] = near[self.native].mean(axis=0)
-                for k, ring in enumerate(self.rings):
-                    out["puckers"][part, 2 * k : 2 * k + 2] = pucker(x, ring).T
         broken = ~np.isfinite(frames_nm).all(axis=(1, 2))
         if broken.any():
             for values in out.values():
@@ -213,11 +181,9 @@ class Probes:
 def find_probes(
     scene: Scene, sample_nm: AnyFloat, *, parent: Scene | None = None, kept: IntArray | None = None
 ) -> Probes:
-    """Return what to measure on `scene`, given finite frames of the reference `(n, n_atoms, 3)` nm.
-
-    Where `scene` is what is left of a larger `parent`, its atoms `kept`, torsions and rings are found in the parent,
-    and those whose atoms are all left are measured.
-    """
+    """Return what to measure on `scene`, given finite frames of the reference `(n, n_atoms, 3)` nm. Where `scene` is
+    what is left of a larger `parent`, its atoms `kept`, torsions are found in the parent, and those whose atoms are all
+    left are measured."""
     whole = parent or scene
     atoms = np.arange(scene.n_atoms) if kept is None else kept
     place = {int(atom): k for k, atom in enumerate(atoms)}
@@ -228,7 +194,6 @@ def find_probes(
     torsions = tuple(
         t._replace(quad=placed([t.quad])[0], equal=placed(t.equal)) for t in find_torsions(whole) if placed([t.quad])
     )
-    rings = placed(find_rings(whole))
     left_out: list[tuple[str, str]] = []
     angles = _angles(scene)
     if len(angles) > MAX_COLUMNS:
@@ -243,7 +208,6 @@ def find_probes(
     equal_contacts, equal_triplets = equal_rows(contacts, classes), equal_rows(triplets, classes)
     in_contact = _share(lambda x: squared_distance(x, contacts) < contact_nm**2, blocks, equal_contacts)
     bonded = _share(lambda x: is_formed(x, triplets), blocks, equal_triplets)
-    amplitude = [np.mean(np.concatenate([pucker(b, r)[0] for b in blocks])) for r in rings]
     return Probes(
         scene=scene,
         torsions=torsions,
@@ -256,11 +220,9 @@ def find_probes(
         contacts=contacts[_foremost(np.minimum(in_contact, 1 - in_contact), equal_contacts, "contacts", left_out)],
         native=np.flatnonzero(in_contact > 0.5),
         hydrogen_bonds=triplets[_foremost(bonded, equal_triplets, "hydrogen bonds", left_out)],
-        rings=tuple(r for r, q in zip(rings, amplitude, strict=True) if q > _FLAT_RING_NM),
         classes=classes,
-        chains=find_chains(whole, place),
+        chains=find_chains(scene),
         left_out=tuple(left_out),
-        whole=kept is None,
     )
 
 
@@ -273,11 +235,8 @@ def _folded(angles_rad: FloatArray, fold: int) -> FloatArray:
 
 
 def mean_structure(frames_nm: AnyFloat) -> FloatArray:
-    """Return the mean `(n_atoms, 3)` nm of frames laid over it, found by superposing and averaging in turn.
-
-    Starts at the frame in the middle; `_ROUNDS` turns, after which flexible molecules no longer move by more than the
-    spread of their frames. Source: generalised Procrustes analysis, Gower, Psychometrika 40, 33 (1975).
-    """
+    """Return the mean `(n_atoms, 3)` nm of frames laid over it, found by superposing and averaging in turn from the
+    frame in the middle on, `_ROUNDS` times (generalised Procrustes analysis, Gower, Psychometrika 40, 33, 1975)."""
     frames = np.asarray(frames_nm, dtype=np.float64)
     mean: FloatArray = frames[len(frames) // 2]
     for _ in range(_ROUNDS):
@@ -337,11 +296,8 @@ def _alpha_carbons(scene: Scene) -> IntArray:
 
 
 def _contact_pairs(scene: Scene) -> tuple[IntArray, float]:
-    """Pairs that may touch, and the distance below which they do.
-
-    Chains of `_MANY_RESIDUES` or more: alpha carbons three or more residues apart, 0.8 nm. Otherwise heavy atoms more
-    than three bonds apart, 0.45 nm.
-    """
+    """Pairs that may touch, and the distance below which they do: in chains of `_MANY_RESIDUES` or more alpha carbons
+    three or more residues apart, 0.8 nm; otherwise heavy atoms more than three bonds apart, 0.45 nm."""
     alphas = _alpha_carbons(scene)
     if len(alphas) >= _MANY_RESIDUES:
         residue = scene.residue_of_atom[alphas]
@@ -357,8 +313,7 @@ def _contact_pairs(scene: Scene) -> tuple[IntArray, float]:
 
 def _ends(scene: Scene) -> tuple[int, int] | None:
     """The two heavy atoms furthest apart in bonds (the lowest such pair), None below four bonds; of chains of three
-    residues and more the first and the last alpha carbon, of shorter ones atoms of the backbone or of caps, lest a long
-    side chain pass for the end."""
+    residues and more the first and the last alpha carbon, of shorter ones atoms of the backbone or of caps."""
     alphas = _alpha_carbons(scene)
     chains = [scene.chain_of_residue[r] for r in scene.residue_of_atom[alphas].tolist()]
     if len(alphas) >= 3 and chains.count(chains[0]) >= 3:
@@ -399,11 +354,9 @@ def find_triplets(scene: Scene) -> IntArray:
 
 
 def is_formed(columns: AnyFloat, triplets: IntArray) -> BoolArray:
-    """Return `(k, n)`: whether each triplet is a hydrogen bond in each frame of coordinates `(3, n_atoms, n)` nm.
-
-    H...A below 0.25 nm and D-H...A above 120°: Baker and Hubbard, Prog. Biophys. Mol. Biol. 44, 97 (1984), as in
-    `mdtraj.baker_hubbard`. Frames that are not finite form none.
-    """
+    """Return `(k, n)`: whether each triplet is a hydrogen bond in each frame of coordinates `(3, n_atoms, n)` nm: H...A
+    below 0.25 nm and D-H...A above 120° (Baker and Hubbard, Prog. Biophys. Mol. Biol. 44, 97, 1984, as in
+    `mdtraj.baker_hubbard`). Frames that are not finite form none."""
     donor, hydrogen, acceptor = triplets.T
     with np.errstate(invalid="ignore", over="ignore"):
         to_acceptor = squared_distance(columns, triplets[:, 1:])
@@ -416,120 +369,38 @@ def is_formed(columns: AnyFloat, triplets: IntArray) -> BoolArray:
     return formed
 
 
-def find_rings(scene: Scene) -> tuple[tuple[int, ...], ...]:
-    """Return the rings of 4 to 7 atoms, in order from the lowest, with an atom of four neighbours: those that can
-    pucker. Without hydrogens valence does not show in the graph; a flat ring is then found by its amplitude."""
-    graph = bonded_graph(scene)
-    found = []
-    for ring in small_rings(scene):
-        if "H" not in scene.elements or any(graph.degree(i) == 4 for i in ring):
-            start = ring.index(min(ring))
-            turned = [*ring[start:], *ring[:start]]
-            found.append(tuple(turned if turned[1] < turned[-1] else [turned[0], *turned[:0:-1]]))
-    return tuple(found)
+def find_chains(scene: Scene) -> IntArray:
+    """Return atoms N, CA, C, O of every amino acid `(n_residues, 4)`, by their names; none of fewer than
+    `LEAST_RESIDUES`."""
+    keys = zip(scene.residue_of_atom.tolist(), scene.atom_names, strict=True)
+    place = {key: atom for atom, key in enumerate(keys)}
+    rows = [[place.get((k, name), -1) for name in _BACKBONE[:4]] for k in range(len(scene.residue_names))]
+    whole = [row for row in rows if min(row) >= 0]
+    return np.array(whole if len(whole) >= LEAST_RESIDUES else [], dtype=np.int64).reshape(-1, 4)
 
 
-def pucker(columns: AnyFloat, ring: Sequence[int]) -> FloatArray:
-    """Return `(2, n)`: the puckering amplitude Q in nm and an angle in rad, of coordinates `(3, n_atoms, n)` nm.
-
-    The angle is the phase of the second harmonic, phi_2 in [-pi, pi]; for six-membered rings theta in [0, pi] (0 and pi
-    are the chairs, pi/2 boats and twists). The first atom is the lowest in the scene, the second its lower neighbour.
-    Four-membered rings have no second phase: the angle is 0 or pi, the sign of the fold. Source: Cremer and Pople, J.
-    Am. Chem. Soc. 97, 1354 (1975), equations 4 to 14.
-    """
-    n = len(ring)
-    x = columns[:, list(ring)].astype(np.float64)
-    x = x - x.mean(axis=1, keepdims=True)
-    turn = 2.0 * np.pi * np.arange(n) / n
-    first = np.einsum("k,xkn->xn", np.sin(turn), x)
-    second = np.einsum("k,xkn->xn", np.cos(turn), x)
-    normal = np.cross(first, second, axis=0)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        normal /= np.sqrt((normal * normal).sum(0))
-    height = (x * normal[:, None]).sum(0)
-    amplitude = np.sqrt((height**2).sum(0))
-    if n == 4:
-        angle = np.where(height[0] >= 0, 0.0, np.pi)
-    else:
-        in_phase = np.sqrt(2.0 / n) * np.einsum("k,kn->n", np.cos(2 * turn), height)
-        out_of_phase = -np.sqrt(2.0 / n) * np.einsum("k,kn->n", np.sin(2 * turn), height)
-        angle = np.arctan2(out_of_phase, in_phase)
-        if n == 6:
-            q3 = np.einsum("k,kn->n", np.cos(np.pi * np.arange(6)), height) / np.sqrt(6.0)
-            angle = np.arctan2(np.hypot(in_phase, out_of_phase), q3)
-    out: FloatArray = np.stack([amplitude, angle])
-    return out
-
-
-def find_chains(scene: Scene, place: dict[int, int]) -> Chains:
-    """Return the amino acids of `scene`, found in its bond graph, whose four atoms all have a `place` (atom of the
-    scene to column of the frames); none where fewer than `LEAST_RESIDUES` are left."""
-    graph, found = bonded_graph(scene), backbone_torsions(scene)
-    units = {int(q[2]): (int(q[1]), int(q[2]), int(q[3])) for q in found["phi"]}
-    units |= {int(q[1]): (int(q[0]), int(q[1]), int(q[2])) for q in found["psi"]}
-    following = {int(q[2]): int(q[3]) for q in found["psi"]}
-    of_nitrogen = {n: alpha for alpha, (n, _, _) in units.items()}
-    later = {n for n in following.values() if n in of_nitrogen}
-    rows, chain, labels, proline = [], [], [], []
-    for number, start in enumerate(n for n in of_nitrogen if n not in later):
-        nitrogen: int | None = start
-        while nitrogen in of_nitrogen:
-            n, alpha, carbon = units[of_nitrogen[nitrogen]]
-            oxygens = sorted(i for i in graph[carbon] if scene.elements[i] == "O" and graph.degree(i) == 1)
-            named = [i for i in oxygens if scene.atom_names[i] == "O"]
-            atoms = (n, alpha, carbon, *(named or oxygens)[:1])
-            if len(atoms) == 4 and all(i in place for i in atoms):
-                rows.append([place[i] for i in atoms])
-                chain.append(number)
-                labels.append(residue_label(scene, alpha))
-                proline.append(sum(scene.elements[i] == "C" for i in graph[n]) == 3)
-            nitrogen = following.get(carbon)
-    if len(rows) < LEAST_RESIDUES:
-        return NO_CHAINS
-    return Chains(np.array(rows, np.int64), np.array(chain, np.int64), np.array(proline, bool), tuple(labels))
-
-
-def secondary_structure(frames_nm: AnyFloat, chains: Chains) -> npt.NDArray[np.int8]:
-    """Return `COIL`, `HELIX` or `STRAND` of each residue `(n, n_residues)` in frames `(n, n_atoms, 3)` nm.
+def secondary_structure(frames_nm: AnyFloat, scene: Scene, chains: IntArray) -> npt.NDArray[np.int8]:
+    """Return `COIL`, `HELIX` or `STRAND` of each amino acid `(n, n_residues)` in frames `(n, n_atoms, 3)` nm.
 
     DSSP (Kabsch and Sander, Biopolymers 22, 2577, 1983) as MDTraj computes it, in its three letters: helix is H, G and
-    I, strand E and B, coil the rest. Hydrogens are placed by the backbone. A frame that is not finite is coil.
+    I, strand E and B, coil the rest. A frame that is not finite is coil.
     """
-    out = np.zeros((len(frames_nm), len(chains.atoms)), dtype=np.int8)
-    if not len(chains.atoms):
-        return out
-    import mdtraj
+    out = np.zeros((len(frames_nm), len(chains)), dtype=np.int8)
+    finite = np.isfinite(frames_nm).all(axis=(1, 2))
+    if len(chains) and finite.any():
+        import mdtraj
 
-    backbone = np.asarray(frames_nm[:, chains.atoms.ravel()], dtype=np.float32)
-    finite = np.isfinite(backbone).all(axis=(1, 2))
-    if finite.any():
-        letters = mdtraj.compute_dssp(mdtraj.Trajectory(backbone[finite], _topology(chains)))
+        atoms = np.sort(chains.ravel())
+        backbone = np.asarray(frames_nm[finite][:, atoms], dtype=np.float32)
+        letters = mdtraj.compute_dssp(mdtraj.Trajectory(backbone, scene.to_mdtraj_topology().subset(atoms)))
         out[finite] = HELIX * (letters == "H") + STRAND * (letters == "E")
     return out
 
 
-def _topology(chains: Chains) -> Any:
-    """Return MDTraj's topology of the backbones alone: names as DSSP asks for them, whatever the file calls them."""
-    import mdtraj
-    from mdtraj.core import element
-
-    topology = mdtraj.Topology()
-    chain: Any = None
-    for k, proline in enumerate(chains.is_proline):
-        if k == 0 or chains.chain[k] != chains.chain[k - 1]:
-            chain = topology.add_chain()
-        residue = topology.add_residue("PRO" if proline else "ALA", chain)
-        for name, symbol in (("N", "nitrogen"), ("CA", "carbon"), ("C", "carbon"), ("O", "oxygen")):
-            topology.add_atom(name, getattr(element, symbol), residue)
-    return topology
-
-
 def equal_rows(rows: IntArray, classes: IntArray) -> list[npt.NDArray[np.intp]]:
-    """Return the groups of `rows` of atoms `(k, m)`, forwards or backwards, that the molecule's symmetry makes equal.
-
-    `classes` `(n_atoms,)` are equal for atoms without an identity of their own. Groups come in order of their first
-    row: the six C-H bonds of two equal methyl groups are one, and which hydrogen is called the first does not matter.
-    """
+    """Return the groups of `rows` of atoms `(k, m)`, forwards or backwards, that the molecule's symmetry makes equal,
+    in order of their first row: the six C-H bonds of two equal methyl groups are one. `classes` `(n_atoms,)` are equal
+    for atoms without an identity of their own."""
     found: dict[tuple[int, ...], list[int]] = {}
     for k, row in enumerate(classes[rows].tolist()):
         found.setdefault(min(tuple(row), tuple(row[::-1])), []).append(k)
@@ -558,8 +429,8 @@ class Features(InSegments):
     """Per-frame measurements of one ensemble, one array per segment.
 
     `phi` `(n, n_phi)` and `psi` `(n, n_psi)` rad, `bonds_nm` `(n, n_bonds)`, `flags` `(n,)`; all NaN-carrying where a
-    frame is not finite. `chunk_idx` and `changed` `(n,)` or None; `energy_kj` `(n,)` kJ/mol, NaN where none was
-    computed, or None; `moved_nm` `(n,)` how far atoms are, root mean square, from where they were in the frame before
+    frame is not finite. `chunk_idx` `(n,)` or None; `energy_kj` `(n,)` kJ/mol, NaN where none was computed, or None;
+    `moved_nm` `(n,)` how far atoms are, root mean square, from where they were in the frame before
     (NaN for the first), centres of both laid together, or None; `grid_nm` what coordinates were rounded to, 0 for
     nothing. `series` holds the families `(n, k)` of `probes`, both or neither.
     """
@@ -573,7 +444,6 @@ class Features(InSegments):
     chunk_idx: Sequence[npt.NDArray[np.int32]] | None
     series: Mapping[Family, Sequence[npt.NDArray[Any]]] = field(default_factory=dict)
     probes: Probes | None = None
-    changed: Sequence[BoolArray] | None = None
     energy_kj: Sequence[FloatArray] | None = None
     moved_nm: Sequence[Series] | None = None
     grid_nm: float = 0.0
@@ -598,7 +468,7 @@ class Features(InSegments):
         def cut(series: Sequence[npt.NDArray[Any]]) -> list[npt.NDArray[Any]]:
             return [s[a:b] for s, (a, b) in zip(series, spans, strict=True) if b > a]
 
-        names = ("phi", "psi", "bonds_nm", "flags", "chunk_idx", "changed", "energy_kj", "moved_nm")
+        names = ("phi", "psi", "bonds_nm", "flags", "chunk_idx", "energy_kj", "moved_nm")
         parts: dict[str, Any] = {name: cut(getattr(self, name)) for name in names if getattr(self, name) is not None}
         return replace(self, **parts, series={family: cut(values) for family, values in self.series.items()})
 
@@ -657,8 +527,8 @@ class Baseline:
                         series.setdefault(family, []).append(np.empty((n, values.shape[1]), dtype=values.dtype))
                     series[family][-1][part] = values
         return Features(
-            ensemble.label, ensemble.lag_ps, phi, psi, lengths, flags, ensemble.chunk_idx, series, probes,
-            ensemble.changed, None, moved, ensemble.grid_nm,
+            ensemble.label, ensemble.lag_ps, phi, psi, lengths, flags, ensemble.chunk_idx, series, probes, None, moved,
+            ensemble.grid_nm,
         )  # fmt: skip
 
 

@@ -13,9 +13,10 @@ import numpy as np
 
 from surrogate.comparison.measure.statistics import FloatArray, IntArray, Segments
 from systems.chemistry.graph import atom_classes, backbone_torsions, bonded_graph, rotatable_torsions
+from systems.chemistry.validity import small_rings
 from systems.scene import Scene
 
-Kind = Literal["ω", "χ", "rotatable", "rotor"]
+Kind = Literal["ω", "χ", "rotatable", "rotor", "ring"]
 Quad = tuple[int, int, int, int]
 
 _FLAT = 0.25
@@ -26,13 +27,10 @@ _LEAST_PEAK = 1e-3
 
 
 class Torsion(NamedTuple):
-    """One torsion: its four atoms, a name for people, its kind, and by how many equal positions it is folded.
-
-    A `fold` of m means that turning by 2π/m gives the same molecule (3 for methyl, 2 for phenyl): what is measured is
-    then m times the angle, which runs once round the circle while the torsion runs from one equal position to the next.
-    `equal` are the atoms from which it could as well be told, `quad` among them: the direction of the mean over them is
-    taken, so that it does not matter which of the hydrogens of a methyl group is called the first.
-    """
+    """One torsion: its four atoms, a name for people, its kind, and by how many equal positions it is folded. A `fold`
+    of m means that turning by 2π/m gives the same molecule (3 for methyl, 2 for phenyl): m times the angle is measured.
+    `equal` are the atoms that could be used as well, `quad` among them: the direction of the mean over them is taken,
+    so that it does not matter which hydrogen of a methyl group is called the first."""
 
     quad: Quad
     label: str
@@ -48,77 +46,58 @@ def residue_label(scene: Scene, atom: int) -> str:
 
 
 def find_torsions(scene: Scene) -> list[Torsion]:
-    """Return omega of every peptide bond, chi of every side chain, every other rotatable bond and every rotor.
-
-    Found in the bond graph; phi and psi are left out (`structure.backbone` has them). A rotor is a group whose only
-    further atoms are hydrogens (methyl, hydroxyl, ammonium). Chi is named and its atoms chosen by IUPAC-IUB 1970, rule
-    4: from N through CA outwards, branch 1 before branch 2.
-    """
+    """Return omega of every peptide bond, chi of every side chain (MDTraj's, by the names of atoms), every other
+    rotatable bond, every rotor, a group whose only further atoms are hydrogens (methyl, hydroxyl, ammonium), and one
+    torsion within every ring of 4 to 7 atoms that is not flat, which shows its pucker. Phi and psi are left out
+    (`structure.backbone` has them)."""
     graph = bonded_graph(scene)
     backbone = backbone_torsions(scene)
     classes = atom_classes(scene).tolist()
     taken = {frozenset(q[1:3]) for name in ("phi", "psi", "omega") for q in backbone[name].tolist()}
     found = [Torsion((a, b, c, d), f"ω {_where(scene, b, c)}", "ω", 1) for a, b, c, d in backbone["omega"].tolist()]
-    side = _side_chains(graph, backbone["phi"].tolist(), backbone["psi"].tolist())
+    chi = _chi_torsions(scene)
     for a, b, c, d in rotatable_torsions(scene, rotors=True).tolist():
         if frozenset((b, c)) not in taken:
-            found.append(_named(scene, graph, classes, side, (a, b, c, d)))
+            found.append(_named(scene, graph, classes, chi, (a, b, c, d)))
+    for ring in small_rings(scene):
+        # Without hydrogens valence does not show; the torsion of a flat ring stays where it is.
+        if "H" not in scene.elements or any(graph.degree(i) == 4 for i in ring):
+            start = ring.index(min(ring))
+            a, b, c, d = [*ring[start:], *ring[:start]][:4]
+            found.append(Torsion((a, b, c, d), f"ring {bond_label(scene, b, c)}", "ring", 1))
     return found
 
 
-class _Place(NamedTuple):
-    """Of an atom in a side chain: bonds from CA, the atom before it (N for CA itself)."""
+def _chi_torsions(scene: Scene) -> dict[frozenset[int], tuple[Quad, str]]:
+    """Return the atoms and the name of every side-chain torsion, by the two atoms of its bond."""
+    from mdtraj.geometry import dihedral
 
-    depth: int
-    before: int
-
-
-def _side_chains(graph: nx.Graph, phi: Sequence[Sequence[int]], psi: Sequence[Sequence[int]]) -> dict[int, _Place]:
-    """Place of every atom outwards of an alpha carbon, reached without passing a backbone N or C."""
-    alphas = {q[2]: q[1] for q in phi} | {q[1]: q[0] for q in psi}
-    blocked = {a for q in phi for a in (q[0], q[1], q[3])} | {a for q in psi for a in (q[0], q[2], q[3])}
-    places = {alpha: _Place(0, nitrogen) for alpha, nitrogen in alphas.items()}
-    layer = sorted(places)
-    while layer:
-        reached = []
-        for atom in layer:
-            for j in sorted(graph[atom]):
-                if j not in places and j not in blocked:
-                    places[j] = _Place(places[atom].depth + 1, atom)
-                    reached.append(j)
-        layer = reached
-    return places
+    topology = scene.to_mdtraj_topology()
+    found = {}
+    for number in range(1, 6):
+        for a, b, c, d in getattr(dihedral, f"indices_chi{number}")(topology).tolist():
+            found[frozenset((b, c))] = ((a, b, c, d), f"χ{number} {residue_label(scene, b)}")
+    return found
 
 
-def _named(scene: Scene, graph: nx.Graph, classes: Sequence[int], side: dict[int, _Place], quad: Quad) -> Torsion:
+def _named(
+    scene: Scene, graph: nx.Graph, classes: Sequence[int], chi: dict[frozenset[int], tuple[Quad, str]], quad: Quad
+) -> Torsion:
+    """Return the torsion about the bond of `quad`, chi by its own atoms."""
+    kind: Kind = "rotatable"
+    if frozenset(quad[1:3]) in chi:
+        kind, (quad, label) = "χ", chi[frozenset(quad[1:3])]
     a, b, c, d = quad
     turns = [_equal_positions(scene, graph, classes, *bond) for bond in ((b, c), (c, b))]
-    fold = math.lcm(*turns)
-
-    def equal(a: int, b: int, c: int, d: int, turns: Sequence[int]) -> tuple[Quad, ...]:
-        starts, ends = (
-            [j for j in sorted(graph[i]) if j != other] if n > 1 else [alone]
-            for i, other, alone, n in ((b, c, a, turns[0]), (c, b, d, turns[1]))
-        )
-        return tuple((i, b, c, j) for i in starts for j in ends)
-
-    heavy = [[j for j in graph[i] if j != k and scene.elements[j] != "H"] for i, k in ((b, c), (c, b))]
-    in_side = b in side and c in side and abs(side[b].depth - side[c].depth) == 1
-    if not (heavy[0] and heavy[1]):
-        return Torsion((a, b, c, d), f"rotor {bond_label(scene, b, c)}", "rotor", fold, equal(*quad, turns))
-    if not in_side:
-        return Torsion((a, b, c, d), f"torsion {bond_label(scene, b, c)}", "rotatable", fold, equal(*quad, turns))
-    near, far = (b, c) if side[b].depth < side[c].depth else (c, b)
-
-    def branch(atom: int) -> tuple[int, int, int]:
-        # CG1 before CG2, by canonical rank where names carry no number.
-        digits = "".join(x for x in scene.atom_names[atom] if x.isdigit())
-        return int(digits or 0), -classes[atom], atom
-
-    outer = min((j for j in graph[far] if j != near and scene.elements[j] != "H"), key=branch)
-    label = f"χ{side[near].depth + 1} {residue_label(scene, near)}"
-    chosen = (side[near].before, near, far, outer)
-    return Torsion(chosen, label, "χ", fold, equal(*chosen, turns if near == b else turns[::-1]))
+    starts, ends = (
+        [j for j in sorted(graph[i]) if j != other] if n > 1 else [alone]
+        for i, other, alone, n in ((b, c, a, turns[0]), (c, b, d, turns[1]))
+    )
+    if any(all(scene.elements[j] == "H" for j in graph[i] if j != k) for i, k in ((b, c), (c, b))):
+        kind, label = "rotor", f"rotor {bond_label(scene, b, c)}"
+    elif kind == "rotatable":
+        label = f"torsion {bond_label(scene, b, c)}"
+    return Torsion(quad, label, kind, math.lcm(*turns), tuple((i, b, c, j) for i in starts for j in ends))
 
 
 def _equal_positions(scene: Scene, graph: nx.Graph, classes: Sequence[int], atom: int, other: int) -> int:

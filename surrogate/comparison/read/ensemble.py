@@ -4,7 +4,6 @@ read from files, with what they say of themselves: settings, costs, what guards 
 from __future__ import annotations
 
 import math
-from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -20,15 +19,16 @@ from surrogate.comparison.read.stored_frames import (
     StoredFrames,
     bond_tree,
     grid_of,
+    length_error_nm,
     match_scenes,
     rounded,
-    rounding_note,
     solute_atoms,
 )
 from systems.errors import InputError, OutOfDomainError, TrajectoryError, listed
 from systems.scene import Scene, part_of
 from systems.trajectory.base import TrajectoryReader
 from systems.trajectory.codec import DIFFERENCE_COLUMN, open_trajectory, reweighting
+from systems.trajectory.joined import replicas_of
 from systems.units import format_time_ps
 
 Frames = npt.NDArray[np.float32] | StoredFrames
@@ -36,13 +36,11 @@ Flags = npt.NDArray[np.uint16]
 IntArray = npt.NDArray[np.int64]
 
 IN_MEMORY_BYTES = 128 * 2**20
-# What a note begins with of files that hold fewer frames than were asked for.
+# How a note begins on files of runs that ended early.
 STOPPED = "Stopped before the end"
 _LEAST_FRAMES = 10
 # Of a sample of frames, about as many numbers.
 _SAMPLED_VALUES = 20_000_000
-# Scalar column, 0 for a frame that nothing was done about.
-GUARD_COLUMN = "intervention"
 FloatArray = npt.NDArray[np.float64]
 
 # Fewer energies of a reference say nothing of how far its ensemble is the model's.
@@ -65,15 +63,15 @@ def length_words(segment_lengths: Sequence[int], lag_ps: float) -> str:
     return each if len(segment_lengths) == 1 else f"{len(segment_lengths)} replicas of {each}"
 
 
-class InSegments(ABC):
+class InSegments:
     """Base of what holds one value or more for every frame, `lag_ps` apart, in segments of unbroken time."""
 
     lag_ps: float
 
     @property
-    @abstractmethod
     def segment_lengths(self) -> list[int]:
         """Frames in each segment."""
+        raise NotImplementedError
 
     @property
     def n_frames(self) -> int:
@@ -96,10 +94,10 @@ class Ensemble(InSegments):
 
     `segments`: each `(n, n_atoms, 3)` float32 nm, atoms in the order of `scene`, in memory or in their file, to be read
     by slices; `kept`: which atoms of the reference's scene these are, None for all; `lag_ps`: time between frames;
-    `flags` `(n,)` uint16, `chunk_idx` `(n,)` int32 and `changed` `(n,)` bool (what a rollout's guards changed) per
-    segment, or None where the file does not say; `record`: what the writer said of itself (costs summed over files);
-    `sources`: the files; `top`, `stated_lag_ps`: what the user said of them; `notes`: what was done on reading;
-    `grids_nm`: what the coordinates of each segment are rounded to, 0 for nothing (none given: nothing).
+    `flags` `(n,)` uint16 and `chunk_idx` `(n,)` int32 per segment, or None where the file does not say; `record`: what
+    the writer said of itself (costs summed over files); `sources`: the files; `top`, `stated_lag_ps`: what the user
+    said of them; `notes`: what was done on reading; `grids_nm`: what the coordinates of each segment are rounded to, 0
+    for nothing (none given: nothing).
     Raises InputError for shapes that do not fit, no frame at all, or a lag that is not positive.
     """
 
@@ -115,7 +113,6 @@ class Ensemble(InSegments):
     stated_lag_ps: float | None = None
     notes: tuple[str, ...] = ()
     kept: IntArray | None = None
-    changed: Sequence[npt.NDArray[np.bool_]] | None = None
     grids_nm: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
@@ -128,7 +125,7 @@ class Ensemble(InSegments):
                 )
         if self.n_frames == 0:
             raise InputError(f"{self.label}: no frames.")
-        for name, series in (("flags", self.flags), ("chunk_idx", self.chunk_idx), ("changed", self.changed)):
+        for name, series in (("flags", self.flags), ("chunk_idx", self.chunk_idx)):
             if series is not None and [len(s) for s in series] != self.segment_lengths:
                 raise InputError(f"{self.label}: {name} do not match the segments in length.")
 
@@ -153,7 +150,7 @@ class Ensemble(InSegments):
         if stride == 1:
             return self
         segments = [s.thinned(stride) if isinstance(s, StoredFrames) else s[::stride] for s in self.segments]
-        columns = {"flags": self.flags, "chunk_idx": self.chunk_idx, "changed": self.changed}
+        columns = {"flags": self.flags, "chunk_idx": self.chunk_idx}
         thinned: dict[str, Any] = {k: [x[::stride] for x in series] for k, series in columns.items() if series}
         note = f"{self.label}: one frame in {stride} is used, for equal save intervals."
         return replace(self, segments=segments, lag_ps=self.lag_ps * stride, notes=(*self.notes, note), **thinned)
@@ -185,22 +182,22 @@ def load_ensemble(
     lag_ps: float | None = None,
     in_memory_bytes: int = IN_MEMORY_BYTES,
 ) -> Ensemble:
-    """Read one or several trajectory files as the replicas of one candidate.
+    """Read one or several trajectory files, of any format that MDTraj or MDAnalysis reads, as the replicas of one
+    candidate.
 
-    Any format that MDTraj or MDAnalysis reads. Atoms are put in the order of `template` (matched by the bond graph
-    where order or names differ); a file that holds only some of them (no hydrogens, backbone) gives an ensemble of
-    those, named in `kept`. Without a template the first file's scene is it, less water and single ions. Molecules of a
-    periodic file are made whole. A file whose time jumps is cut there into segments. `lag_ps` overrides the times in
-    the files. `top` is the topology for formats that hold none. Files beyond the first `in_memory_bytes` of all
-    coordinates together are left where they are and read block by block. Raises InputError (no files, nothing known of
-    the topology, no times without `lag_ps`, replicas with different lags or atoms), OutOfDomainError (another molecule)
-    and TrajectoryError (a damaged file, uneven time).
+    Atoms are put in the order of `template` (matched by the bond graph where order or names differ); a file that holds
+    only some of them gives an ensemble of those, named in `kept`. Without a template the first file's scene is it, less
+    water and single ions. Molecules of a periodic file are made whole; a file whose time jumps is cut there into
+    segments. `lag_ps` overrides the times in the files, `top` is the topology for formats that hold none. Files beyond
+    the first `in_memory_bytes` of all coordinates together are read block by block. Raises InputError (no files, no
+    topology, no times without `lag_ps`, replicas with different lags or atoms), OutOfDomainError (another molecule) and
+    TrajectoryError (a damaged file, uneven time).
     """
     if not paths:
         raise InputError("No trajectory file was given.")
     name = label or Path(paths[0]).name + (f" + {len(paths) - 1} more" if len(paths) > 1 else "")
     segments: list[Frames] = []
-    columns: dict[str, list[Any]] = {"flags": [], "chunk_idx": [], "changed": []}
+    columns: dict[str, list[Any]] = {"flags": [], "chunk_idx": []}
     records: list[dict[str, Any]] = []
     scalars: list[Mapping[str, FloatArray]] = []
     lags: list[float] = []
@@ -212,6 +209,8 @@ def load_ensemble(
         reader, frames, template, own = open_matched(Path(path), template, None if top is None else Path(top), notes)
         kept.append(own)
         lag, cuts, note = time_axis(str(path), reader.time_ps if reader.times_known else None, reader.n_frames, lag_ps)
+        replicas = replicas_of(reader.record, reader.n_frames)
+        cuts = sorted({*cuts, *(part.start for part, _ in replicas[1:])})
         notes += note
         lags.append(lag)
         grids += [grid_of(reader)] * (len(cuts) + 1)
@@ -222,16 +221,12 @@ def load_ensemble(
             reader.close()
         else:
             segments += frames.split(cuts)
-        guarded = reader.scalars[GUARD_COLUMN] > 0 if GUARD_COLUMN in reader.scalars else None
-        of_file = {
-            "flags": None if reader.flags is None else np.asarray(reader.flags, dtype=np.uint16),
-            "chunk_idx": None if reader.chunk_idx is None else np.asarray(reader.chunk_idx, dtype=np.int32),
-            "changed": guarded,
-        }
-        for key, values in of_file.items():
-            columns[key] += [] if values is None else np.split(values, cuts)
-        records.append(reader.record)
-        scalars.append(reader.scalars)
+        for key, values, kind in (("flags", reader.flags, np.uint16), ("chunk_idx", reader.chunk_idx, np.int32)):
+            columns[key] += [] if values is None else np.split(np.asarray(values, dtype=kind), cuts)
+        if len(replicas) > 1:
+            notes.append(f"{path}: {len(replicas)} replicas in one file, which are compared as separate runs.")
+        records += [record for _, record in replicas]
+        scalars += [{key: values[part] for key, values in reader.scalars.items()} for part, _ in replicas]
         if reader.record.get("completed") is False:
             stopped.append(f"{path} ({reader.n_frames} frames)")
     assert template is not None
@@ -263,11 +258,9 @@ def load_ensemble(
 
 def alike(ensembles: Sequence[Ensemble]) -> tuple[list[Ensemble], IntArray | None]:
     """Return the ensembles on the atoms that all of them hold, thinned by whole strides to their least common save
-    interval, rounded to the coarsest grid of any; and which of the first's atoms these are (None: all).
-
-    The first is the reference, in whose atoms the others' `kept` counts. Raises InputError when fewer than three atoms
-    are left, or when no common interval leaves 10 frames of each.
-    """
+    interval, rounded to the coarsest grid of any; and which of the first's (the reference's) atoms these are (None:
+    all). Raises InputError when fewer than three atoms are left, or when no common interval leaves 10 frames of
+    each."""
     reference, out = ensembles[0], list(ensembles)
     every = np.arange(reference.scene.n_atoms)
     parts = [e.kept for e in out[1:] if e.kept is not None]
@@ -292,7 +285,11 @@ def alike(ensembles: Sequence[Ensemble]) -> tuple[list[Ensemble], IntArray | Non
     out = [e.strided(stride) for e, stride in zip(out, strides, strict=True)]
     grid = max(e.grid_nm for e in out)
     if grid > 0:
-        note = rounding_note([e.label for e in out if e.grid_nm == grid], grid)
+        note = (
+            f"{' and '.join(e.label for e in out if e.grid_nm == grid)}: coordinates are rounded to {10 * grid:.3g} Å, "
+            f"which alone makes bond lengths vary by {10 * length_error_nm(grid):.2g} Å; all trajectories are compared "
+            "rounded alike, and what is narrower is hidden."
+        )
         out = [e.on_grid(grid) for e in out]
         out[0] = replace(out[0], notes=(*out[0].notes, note))
     return out, common
@@ -353,11 +350,9 @@ def reweighting_notes(
 def open_matched(
     path: Path, template: Scene | None, top: Path | None, notes: list[str]
 ) -> tuple[TrajectoryReader, StoredFrames, Scene, IntArray]:
-    """Open a file and match its atoms to `template` (its own solute where None); what was done goes to `notes`.
-
-    Returns the reader, its frames in the template's order, the template, and which of its atoms they are. Raises
-    InputError, OutOfDomainError (another molecule), TrajectoryError.
-    """
+    """Open a file and match its atoms to `template` (its own solute where None); what was done goes to `notes`. Return
+    the reader, its frames in the template's order, the template, and which of its atoms they are. Raises InputError,
+    OutOfDomainError (another molecule), TrajectoryError."""
     reader = open_trajectory(path, top=top)
     if reader.n_frames == 0:
         reader.close()

@@ -37,7 +37,6 @@ _LEAST_NUMBERS = 24
 _OFF, _WORST_OFF = 0.02, 0.2
 _FLAT = 0.45
 _PSEUDO_BOND_NM = 0.11
-_BACKBONE = ("N", "CA", "C", "O")
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,11 +65,9 @@ def bond_tree(scene: Scene) -> BondTree:
 
 
 def make_whole(frames_nm: Frames, cells_nm: npt.NDArray[np.floating], tree: BondTree) -> Frames:
-    """Return frames `(n, n_atoms, 3)` nm with no bond across the cell `(n, 3, 3)` nm, in a new array.
-
-    Each atom is put beside the one it is bonded to, then each molecule's centre at its image nearest to that of the
-    largest. Right for bonds shorter than half of the cell's least width.
-    """
+    """Return frames `(n, n_atoms, 3)` nm with no bond across the cell `(n, 3, 3)` nm, in a new array: each atom beside
+    the one it is bonded to, then each molecule's centre at its image nearest to that of the largest. Right for bonds
+    shorter than half of the cell's least width."""
     x = np.array(frames_nm, dtype=np.float32)
     cell = np.asarray(cells_nm, dtype=np.float64)
     inverse = np.linalg.inv(cell)
@@ -95,12 +92,10 @@ def make_whole(frames_nm: Frames, cells_nm: npt.NDArray[np.floating], tree: Bond
 
 
 class StoredFrames:
-    """Frames of one open file, an array `(n, n_atoms, 3)` float32 nm to whoever slices it.
-
-    Atoms are those of `order` (all where None), molecules made whole with `tree` (not where None), coordinates rounded
-    to `grid_nm` (not where 0). Slices read from the file; `thinned`, `restricted` and `on_grid` do not. The file is
-    open for as long as anybody refers to it.
-    """
+    """Frames of one open file, an array `(n, n_atoms, 3)` float32 nm to whoever slices it: atoms of `order` (all where
+    None), molecules made whole with `tree` (not where None), coordinates rounded to `grid_nm` (not where 0). Slices
+    read from the file, which is open for as long as anybody refers to it; `thinned`, `restricted` and `on_grid` read
+    nothing."""
 
     def __init__(
         self,
@@ -201,15 +196,6 @@ def angle_variance(
     return np.asarray(grid_nm**2 / 6.0 * (1.0 / a**2 + 1.0 / b**2 - np.cos(angle) / (a * b)))
 
 
-def rounding_note(labels: list[str], grid_nm: float) -> str:
-    """Return the line on the trajectories whose rounding all are compared at."""
-    error = 10.0 * length_error_nm(grid_nm)
-    return (
-        f"{' and '.join(labels)}: coordinates are rounded to {10.0 * grid_nm:.3g} Å, which alone makes bond lengths "
-        f"vary by {error:.2g} Å; all trajectories are compared rounded alike, and what is narrower is hidden."
-    )
-
-
 class Match(NamedTuple):
     """Atom `order[k]` of the file is atom `kept[k]` of the template; `how` says by what they were matched."""
 
@@ -236,9 +222,9 @@ def solute_atoms(scene: Scene) -> IntArray:
 def match_scenes(scene: Scene, template: Scene) -> Match:
     """Match a file's `scene` to the `template`: by the bonded graph when both hold one molecule, else what both have.
 
-    Atoms that only one of them holds (water, hydrogens, side chains that were not saved) are left out: first by names
-    and residues, then heavy atoms by the bonded graph with handedness, then the backbone, then alpha carbons in order.
-    Raises OutOfDomainError when they are different molecules.
+    Atoms that only one of them holds (water, hydrogens, side chains that were not saved) are left out: by names and
+    residues, or else heavy atoms by the bonded graph with handedness. Raises OutOfDomainError when they are different
+    molecules.
     """
     everything = np.arange(template.n_atoms)
     if scene.topology_hash == template.topology_hash:
@@ -250,12 +236,7 @@ def match_scenes(scene: Scene, template: Scene) -> Match:
     except OutOfDomainError as error:
         if sorted(solute.elements) == sorted(template.elements):
             raise
-        heavy = solute.heavy_idx, template.heavy_idx
-        found = (
-            _by_names(solute, template)
-            or _by_graph(solute, heavy[0], template, heavy[1], "the bond graph of the heavy atoms")
-            or _by_backbone(solute, template)
-        )
+        found = _by_names(solute, template) or _by_heavy_atoms(solute, template)
         if found is None:
             raise OutOfDomainError(f"{error} Nor is one of them a part of the other.") from error
     rank = np.argsort(found.kept)
@@ -263,10 +244,8 @@ def match_scenes(scene: Scene, template: Scene) -> Match:
 
 
 def _by_names(scene: Scene, template: Scene) -> Match | None:
-    """Atoms of equal name in residues of equal name and number; None unless one side's heavy atoms are all found.
-
-    The bonds among the atoms found must be the same, so that equal names in different molecules do not match.
-    """
+    """Atoms of equal name in residues of equal name and number, with the same bonds among them; None unless one side's
+    heavy atoms are all found."""
     ours, theirs = _named(scene), _named(template)
     if ours is None or theirs is None:
         return None
@@ -294,28 +273,8 @@ def _bonds_among(scene: Scene, atoms: IntArray) -> set[tuple[int, int]]:
     return {(min(bond), max(bond)) for bond in inside}
 
 
-def _by_backbone(scene: Scene, template: Scene) -> Match | None:
-    """N, CA, C, O of every residue, or CA alone, by graph and then by the order and names of residues."""
-    for names in (_BACKBONE, _BACKBONE[:3]):
-        ours, theirs = _called(scene, names), _called(template, names)
-        if len(ours) == scene.n_atoms or len(theirs) == template.n_atoms:
-            found = _by_graph(scene, ours, template, theirs, "the bond graph of the backbone")
-            if found is not None:
-                return found
-    ours, theirs = _called(scene, ("CA",)), _called(template, ("CA",))
-    if (len(ours) == scene.n_atoms or len(theirs) == template.n_atoms) and len(ours) == len(theirs) > 2:
-        sides = ((scene, ours), (template, theirs))
-        named = [[s.residue_names[int(s.residue_of_atom[i])] for i in atoms] for s, atoms in sides]
-        if named[0] == named[1]:
-            return Match(ours, theirs, "the sequence of alpha carbons")
-    return None
-
-
-def _called(scene: Scene, names: tuple[str, ...]) -> IntArray:
-    return np.array([i for i, name in enumerate(scene.atom_names) if name in names], dtype=np.int64)
-
-
-def _by_graph(scene: Scene, ours: IntArray, template: Scene, theirs: IntArray, how: str) -> Match | None:
+def _by_heavy_atoms(scene: Scene, template: Scene) -> Match | None:
+    ours, theirs = scene.heavy_idx, template.heavy_idx
     if len(ours) != len(theirs) or len(ours) < 3:
         return None
     parts = [_with_pseudo_hydrogens(part_of(s, atoms)) for s, atoms in ((scene, ours), (template, theirs))]
@@ -323,7 +282,7 @@ def _by_graph(scene: Scene, ours: IntArray, template: Scene, theirs: IntArray, h
         order = match_atoms(*parts)[: len(theirs)]
     except OutOfDomainError:
         return None
-    return Match(ours[order], theirs, how)
+    return Match(ours[order], theirs, "the bond graph of the heavy atoms")
 
 
 def _with_pseudo_hydrogens(scene: Scene) -> Scene:

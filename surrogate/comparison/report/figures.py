@@ -16,7 +16,7 @@ import numpy as np
 
 from surrogate.comparison.measure.distributions import free_energy_kj
 from surrogate.comparison.measure.statistics import FloatArray
-from surrogate.comparison.rows.charts import BarChart, Chart, Histogram, Landscape, Line, LineChart, Section
+from surrogate.comparison.rows.charts import BarChart, Chart, Histogram, Landscape, LineChart, Section
 from systems.units import GAS_CONSTANT_KJ_MOL_K
 
 if TYPE_CHECKING:
@@ -27,17 +27,17 @@ MAP_SIZE, CURVE_SIZE = (2.95, 2.5), (2.95, 2.3)
 DIFFERENCE_MAX_KJ = 4.0
 _DIFFERENCE_CAPTION = "Candidate minus reference: orange where the candidate comes too rarely, purple where too often"
 _MIN_COUNT = 5
+_CIRCLE = np.linspace(-180.0, 180.0, 37)
 # Characters in a line below a narrow picture.
 _LABEL_WIDTH = 36
 # Stand-ins that matplotlib carries through; each becomes a CSS variable in the finished SVG.
-TEXT, CANDIDATE, REPLICATE, LINE, EMPTY, PAGE = (f"#01010{i}" for i in range(1, 7))
+TEXT, CANDIDATE, REPLICATE, LINE, EMPTY = (f"#01010{i}" for i in range(1, 6))
 _VARIABLES = {
     TEXT: "currentColor",
     CANDIDATE: "var(--candidate)",
     REPLICATE: "var(--replicate)",
     LINE: "var(--line)",
     EMPTY: "var(--map-empty)",
-    PAGE: "var(--page)",
 }
 _STYLE: dict[Any, Any] = {
     "svg.fonttype": "none",
@@ -64,17 +64,14 @@ _DASHES: dict[str, Any] = {
 _MAX_NAMES = 12
 # Characters in a line of a name beside its bar.
 _NAME_WIDTH = 20
-# Of the height of the axes: what a line of small print takes.
-_NAME_HEIGHT = 0.07
 _MOST_MAPS, _MOST_CHARTS = 6, 12
 _MOST_ROWS, _MOST_HISTOGRAMS, _MOST_ANSWER_MAPS = 4, 6, 6
 _TITLES: dict[Section, str] = {
-    "equivalent_time": "What it is worth",
+    "equivalent_time": "Equivalent MD time",
     "distributions": "Distributions",
     "kinetics": "How fast things move",
     "structure": "Structure",
-    "forecast": "Forecast error",
-    "validity": "Validity and energies",
+    "validity": "Energies",
 }
 
 
@@ -156,69 +153,36 @@ def draw_chart(chart: Chart, temperature_k: float) -> list[Figure]:
 
 def _lines(chart: LineChart) -> str:
     def paint(figure: Any, axes: Any) -> None:
-        # Of dots those drawn last are seen best.
-        for line in sorted(chart.lines, key=lambda x: x.role != "replicate") if chart.dots else chart.lines:
+        for line in chart.lines:
             colour, dash = _COLOURS[line.role], _DASHES[line.role]
             if line.low is not None and line.high is not None:
                 axes.fill_between(line.x, line.low, line.high, color=colour, alpha=0.17, linewidth=0)
-            if chart.dots:
-                axes.plot(line.x, line.y, color=colour, linestyle="none", marker=".", markersize=2.2, alpha=0.75)
-                continue
             marker = "o" if line.role != "other" and np.count_nonzero(np.isfinite(line.y)) <= 12 else None
             axes.plot(line.x, line.y, color=colour, linestyle=dash, marker=marker, markersize=3)
         if chart.log_x:
             axes.set_xscale("log")
-            _plain_ticks(axes.xaxis, axes.get_xlim())
+            _plain_ticks(axes.xaxis)
         if chart.log_y:
             axes.set_yscale("log")
-            _plain_ticks(axes.yaxis, axes.get_ylim())
+            _plain_ticks(axes.yaxis)
         axes.set_xlabel(chart.x_label)
         axes.set_ylabel(chart.y_label)
         axes.margins(x=0.01)
-        _name_guides(axes, [line for line in chart.lines if line.role == "other"])
 
     return draw(chart.title, CURVE_SIZE, paint)
 
 
-def _plain_ticks(axis: Any, limits: tuple[float, float]) -> None:
-    """Label a logarithmic axis with plain numbers: decades, or 1-2-5, or even steps where it spans less than three."""
-    from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter, NullLocator
+def _plain_ticks(axis: Any) -> None:
+    """Label a logarithmic axis with plain numbers, at 1, 2 and 5 of each decade."""
+    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
-    factor = limits[1] / limits[0]
-    if factor < 3:
-        axis.set_major_locator(MaxNLocator(4))
-        axis.set_minor_locator(NullLocator())
-    elif factor < 300:
-        axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if factor < 30 else (1.0, 3.0)))
+    axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0), numticks=8))
     axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
     axis.set_minor_formatter(NullFormatter())
 
 
-def _name_guides(axes: Any, lines: Sequence[Line]) -> None:
-    """Write the name of each guide line, up to a comma, at its end, except where it would run into another name."""
-    taken: list[float] = []
-    for line in lines:
-        finite = np.flatnonzero(np.isfinite(line.y))
-        if not line.name or not len(finite):
-            continue
-        x, y = line.x[finite[-1]], line.y[finite[-1]]
-        height = float(axes.transAxes.inverted().transform(axes.transData.transform((x, y)))[1])
-        if all(abs(height - other) > _NAME_HEIGHT for other in taken):
-            taken.append(height)
-            axes.annotate(
-                line.name.partition(",")[0],
-                (x, y),
-                xytext=(-4, 4),
-                textcoords="offset points",
-                ha="right",
-                fontsize=7,
-                bbox={"facecolor": PAGE, "edgecolor": "none", "pad": 0.4},
-            )
-
-
 def short_name(name: str) -> str:
-    """Return a name in at most two lines that leave a narrow picture room for what they name; what is cut off ends in
-    an ellipsis."""
+    """Return a name in at most two lines that leave a narrow picture room; what is cut off ends in an ellipsis."""
     lines = textwrap.wrap(name, _NAME_WIDTH, max_lines=2, placeholder=" …")
     return "\n".join(lines) if len(name) > _NAME_WIDTH else name
 
@@ -228,26 +192,25 @@ def _bars(chart: BarChart) -> str:
     names = [short_name(name) for name in chart.names[:_MAX_NAMES]]
     n = len(names)
     height = 0.36 if any("\n" in name for name in names) else 0.24
-    series = (
-        (chart.reference, chart.reference_low, chart.reference_high, TEXT, "o", -0.2),
-        (chart.candidate, chart.candidate_low, chart.candidate_high, CANDIDATE, "s", 0.0),
-        (chart.replicate, None, None, REPLICATE, "D", 0.2),
-    )
 
     def paint(figure: Any, axes: Any) -> None:
-        for values, low, high, colour, marker, shift in series:
-            if values is None:
-                continue
-            at = np.arange(n) + shift
-            if low is not None and high is not None:
-                axes.hlines(at, low[:n], high[:n], color=colour, linewidth=1.2)
-            axes.plot(values[:n], at, linestyle="none", marker=marker, markersize=3.5, color=colour)
+        for line, marker, shift in zip(chart.lines, "osD", (-0.2, 0.0, 0.2), strict=True):
+            at, colour = np.arange(n) + shift, _COLOURS[line.role]
+            if line.low is not None and line.high is not None:
+                axes.hlines(at, line.low[:n], line.high[:n], color=colour, linewidth=1.2)
+            axes.plot(line.y[:n], at, linestyle="none", marker=marker, markersize=3.5, color=colour)
         axes.set_yticks(range(n), labels=names, fontsize=7 if height > 0.3 else 9)
         axes.set_ylim(n - 0.5, -0.5)
         axes.set_xlabel(chart.y_label)
         axes.grid(axis="y", color=LINE, linewidth=0.4)
 
     return draw(chart.title, (CURVE_SIZE[0], max(1.2, 0.6 + height * n)), paint)
+
+
+def _map(axes: Any, energy_kj: FloatArray, edges: tuple[FloatArray, FloatArray], **options: Any) -> Any:
+    box = (float(edges[0][0]), float(edges[0][-1]), float(edges[1][0]), float(edges[1][-1]))
+    chosen = {"vmin": 0.0, "vmax": MAP_MAX_KJ, "cmap": "viridis_r"} | options
+    return axes.imshow(energy_kj.T, origin="lower", extent=box, aspect="auto", interpolation="nearest", **chosen)
 
 
 def energy_map(
@@ -259,7 +222,6 @@ def energy_map(
     difference: bool = False,
 ) -> str:
     """Return one map of energies `(n_x, n_y)` kJ/mol over x and y, or of a `difference` of two; NaN stays empty."""
-    box = (float(edges[0][0]), float(edges[0][-1]), float(edges[1][0]), float(edges[1][-1]))
     low, high = (-DIFFERENCE_MAX_KJ, DIFFERENCE_MAX_KJ) if difference else (0.0, MAP_MAX_KJ)
     step = (high - low) / 4
 
@@ -270,10 +232,7 @@ def energy_map(
         # Without the darkest ends of a diverging scale: they would vanish on a dark page.
         diverging = ListedColormap(colormaps["PuOr_r"](np.linspace(0.14, 0.86, 256)))
         axes.set_facecolor(EMPTY)
-        image = axes.imshow(
-            energy_kj.T, origin="lower", extent=box, aspect="auto", vmin=low, vmax=high, interpolation="nearest",
-            cmap=diverging if difference else colormaps["viridis_r"],
-        )  # fmt: skip
+        image = _map(axes, energy_kj, edges, vmin=low, vmax=high, cmap=diverging if difference else "viridis_r")
         bar = figure.colorbar(image, ax=axes, shrink=0.9, pad=0.02)
         bar.outline.set_visible(False)
         bar.set_ticks(np.arange(low, high + 0.5 * step, step).tolist())
@@ -291,15 +250,14 @@ def _landscape(chart: Landscape, temperature_k: float) -> list[Figure]:
     where = (chart.x_edges, chart.y_edges), (chart.x_label, chart.y_label)
     three = chart.reference, chart.candidate, chart.replicate
     out = []
-    for caption, counts in zip(chart.captions, three, strict=True):
-        energy = np.clip(free_energy_kj(counts, temperature_k), 0.0, MAP_MAX_KJ)
+    for caption, counts in zip(("Reference", "Candidate", "Replicate"), three, strict=True):
+        energy = free_energy_kj(counts, temperature_k)
         out.append(Figure(energy_map(f"{caption}, {chart.title}", energy, *where), caption))
     # Candidate minus reference, empty where there are too few counts.
     p, q = (counts / max(counts.sum(), 1.0) for counts in three[:2])
     with np.errstate(divide="ignore", invalid="ignore"):
-        change = -GAS_CONSTANT_KJ_MOL_K * temperature_k * np.log(q / p)
-    enough = np.maximum(*three[:2]) >= _MIN_COUNT
-    change = np.where(enough, np.clip(change, -DIFFERENCE_MAX_KJ, DIFFERENCE_MAX_KJ), np.nan)
+        change = np.clip(-GAS_CONSTANT_KJ_MOL_K * temperature_k * np.log(q / p), -DIFFERENCE_MAX_KJ, DIFFERENCE_MAX_KJ)
+    change[np.maximum(*three[:2]) < _MIN_COUNT] = np.nan
     picture = energy_map(f"Candidate minus reference, {chart.title}", change, *where, difference=True)
     return [*out, Figure(picture, _DIFFERENCE_CAPTION)]
 
@@ -322,10 +280,8 @@ def albums(charts: Sequence[Chart], temperature_k: float) -> list[Album]:
     )
     for section, title in _TITLES.items():
         mine = [c for c in charts if c.section == section]
-        # A landscape is a row of maps; the last is that of TICA.
-        landscapes = [c for c in mine if isinstance(c, Landscape)]
-        shown = [*landscapes[:_MOST_MAPS], *landscapes[_MOST_MAPS:][-1:]]
-        out += [Album(c.title, draw_chart(c, temperature_k), note) for c in shown]
+        landscapes = [c for c in mine if isinstance(c, Landscape)][:_MOST_MAPS]
+        out += [Album(c.title, draw_chart(c, temperature_k), note) for c in landscapes]
         others = [c for c in mine if not isinstance(c, Landscape)]
         drawn = [figure for chart in others[:_MOST_CHARTS] for figure in draw_chart(chart, temperature_k)]
         n_left = max(len(others) - _MOST_CHARTS, 0)
@@ -335,11 +291,9 @@ def albums(charts: Sequence[Chart], temperature_k: float) -> list[Album]:
 
 
 def overview(drawn: Sequence[tuple[str, Sequence[Chart]]], temperature_k: float) -> MatplotlibFigure:
-    """Return a figure: free energy over φ and ψ, kJ/mol, a row a residue, reference, replicate and each candidate in
-    columns; of a molecule without a backbone the densities of what was measured, each candidate a row.
-
-    `drawn`: of each candidate its label and its charts.
-    """
+    """Return a figure of the charts of each candidate (label, charts): free energy over φ and ψ, kJ/mol, a row a
+    residue, reference, replicate and each candidate in columns; without a backbone the densities of what was measured,
+    each candidate a row."""
     from matplotlib.figure import Figure
 
     labels = [label for label, _ in drawn]
@@ -366,9 +320,7 @@ def overview(drawn: Sequence[tuple[str, Sequence[Chart]]], temperature_k: float)
         shown = [("reference", residue.reference), ("replicate", residue.replicate)]
         shown += [(label, own[k].candidate) for label, own in zip(labels, maps, strict=True)]
         for axes, (name, counts) in zip(row, shown, strict=True):
-            energy = np.clip(free_energy_kj(counts, temperature_k), 0.0, MAP_MAX_KJ)
-            image = axes.imshow(energy.T, origin="lower", extent=(-180, 180, -180, 180), aspect="auto",
-                                vmin=0.0, vmax=MAP_MAX_KJ, cmap="viridis_r")  # fmt: skip
+            image = _map(axes, free_energy_kj(counts, temperature_k), (residue.x_edges, residue.y_edges))
             axes.set_title(f"{name}, {residue.title}", fontsize=8)
             axes.set(xlabel="φ / °" if k == n - 1 else "", ylabel="ψ / °" if axes is row[0] else "")
         figure.colorbar(image, ax=row.tolist(), label="kJ/mol")
@@ -398,8 +350,7 @@ def answer_overview(molecule: str, answer: dict[str, Any]) -> MatplotlibFigure:
         bars.legend(fontsize=8)
     for axes, (label, energy) in zip(others, maps, strict=True):
         values = np.array([[math.nan if x is None else x for x in row] for row in energy])
-        image = axes.imshow(values.T, origin="lower", extent=(-180, 180, -180, 180), vmin=0.0, vmax=MAP_MAX_KJ,
-                            cmap="viridis_r")  # fmt: skip
+        image = _map(axes, values, (_CIRCLE, _CIRCLE))
         axes.set(xlabel="φ / °", ylabel="ψ / °", title=f"{label}, kJ/mol")
         figure.colorbar(image, ax=axes, shrink=0.7)
     return figure
@@ -407,11 +358,9 @@ def answer_overview(molecule: str, answer: dict[str, Any]) -> MatplotlibFigure:
 
 def weighted_maps(maps: dict[str, FloatArray]) -> list[Figure]:
     """Return the report's pictures of MD's answer: the free energy (kJ/mol, `(36, 36)`) of the first residues."""
-    edges = np.linspace(-180.0, 180.0, 37)
-
     found = []
     for label, energy in list(maps.items())[:_MOST_ANSWER_MAPS]:
-        shown = np.where(np.isfinite(energy), np.minimum(energy, MAP_MAX_KJ), np.nan)
-        picture = energy_map(f"By MD's weights, {label}", shown, (edges, edges), ("φ / °", "ψ / °"))
+        shown = np.where(np.isfinite(energy), energy, np.nan)
+        picture = energy_map(f"By MD's weights, {label}", shown, (_CIRCLE, _CIRCLE), ("φ / °", "ψ / °"))
         found.append(Figure(picture, f"{label}: free energy by MD's answer, all its frames weighted"))
     return found

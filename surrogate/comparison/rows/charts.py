@@ -12,7 +12,7 @@ import numpy as np
 
 from surrogate.comparison.measure.statistics import Estimate, FloatArray
 
-Section = Literal["structure", "distributions", "kinetics", "forecast", "validity", "equivalent_time"]
+Section = Literal["structure", "distributions", "kinetics", "validity", "equivalent_time"]
 Role = Literal["reference", "candidate", "replicate", "other"]
 ROLES: tuple[Role, Role, Role] = ("reference", "candidate", "replicate")
 
@@ -58,10 +58,8 @@ class Histogram(Curve):
 
 @dataclass(frozen=True, eq=False)
 class Line(Curve):
-    """One line of a chart: `x` and `y` `(n,)`, NaN in gaps, with a 95 % band where `low` and `high` are given.
-
-    `role` gives the colour; lines that are neither of the three (a baseline, a guide) are "other".
-    """
+    """One line of a chart: `x` and `y` `(n,)`, NaN in gaps, with a 95 % band where `low` and `high` are given. `role`
+    gives the colour."""
 
     name: str
     role: Role
@@ -73,10 +71,7 @@ class Line(Curve):
 
 @dataclass(frozen=True, eq=False)
 class LineChart(Curve):
-    """Lines over one pair of axes; labels carry their units ("lag / ps"), `caption` says what is seen.
-
-    `dots`: a dot for each number instead of strokes between them, where lines would hide each other.
-    """
+    """Lines over one pair of axes; labels carry their units ("lag / ps"), `caption` says what is seen."""
 
     section: Section
     title: str
@@ -86,15 +81,12 @@ class LineChart(Curve):
     lines: tuple[Line, ...]
     log_x: bool = False
     log_y: bool = False
-    dots: bool = False
 
 
 @dataclass(frozen=True, eq=False)
 class Landscape(Curve):
-    """Counts `(n_x, n_y)` over two coordinates, drawn as free energies: φ and ψ of a residue, or two TICs.
-
-    `x_edges` `(n_x + 1,)`, `y_edges` `(n_y + 1,)`; `captions` below the maps of reference, candidate and replicate.
-    """
+    """Counts `(n_x, n_y)` over two coordinates, drawn as free energies: φ and ψ of a residue. `x_edges` `(n_x + 1,)`,
+    `y_edges` `(n_y + 1,)`."""
 
     section: Section
     title: str
@@ -105,40 +97,33 @@ class Landscape(Curve):
     reference: FloatArray
     candidate: FloatArray
     replicate: FloatArray
-    captions: tuple[str, str, str] = ("Reference", "Candidate", "Replicate")
 
 
 @dataclass(frozen=True, eq=False)
 class BarChart(Curve):
-    """One number per name and role, `(n,)`, with 95 % intervals `*_low`, `*_high` where they are given."""
+    """A number for each of `names`; `lines`: of reference, candidate and replicate, `x` counting the names."""
 
     section: Section
     title: str
     caption: str
     y_label: str
     names: tuple[str, ...]
-    reference: FloatArray
-    candidate: FloatArray
-    replicate: FloatArray | None = None
-    reference_low: FloatArray | None = None
-    reference_high: FloatArray | None = None
-    candidate_low: FloatArray | None = None
-    candidate_high: FloatArray | None = None
+    lines: tuple[Line, ...]
 
 
 def bar_chart(
     section: Section, title: str, caption: str, y_label: str, names: Sequence[str], made: Sequence[Sequence[Estimate]]
 ) -> BarChart:
-    """Return the chart of numbers with their 95 % intervals; `made`: of (reference, candidate, replicate), one estimate
-    for each name, in the unit of `y_label`. Intervals of shares in % end at 0 and 100."""
-
-    def pick(which: int, name: str) -> FloatArray:
-        found = np.array([getattr(e, name) for e in made[which]], dtype=np.float64)
-        return np.clip(found, 0.0, 100.0) if y_label.endswith("/ %") else found
-
-    numbers = {f"{role}{end}": pick(k, key) for k, role in enumerate(("reference", "candidate"))
-               for end, key in (("", "value"), ("_low", "low"), ("_high", "high"))}  # fmt: skip
-    return BarChart(section, title, caption, y_label, tuple(names), replicate=pick(2, "value"), **numbers)
+    """Return the chart of numbers with the 95 % intervals of all but the replicate's; `made`: of (reference, candidate,
+    replicate), one estimate for each name. Intervals of shares in % end at 0 and 100."""
+    lines = []
+    for role, estimates in zip(ROLES, made, strict=True):
+        y, low, high = np.array([(e.value, e.low, e.high) for e in estimates]).reshape(-1, 3).T
+        if y_label.endswith("/ %"):
+            low, high = np.clip(low, 0.0, 100.0), np.clip(high, 0.0, 100.0)
+        ends = (None, None) if role == "replicate" else (low, high)
+        lines.append(Line(role, role, np.arange(len(y), dtype=np.float64), y, *ends))
+    return BarChart(section, title, caption, y_label, tuple(names), tuple(lines))
 
 
 Chart = LineChart | Landscape | BarChart | Histogram

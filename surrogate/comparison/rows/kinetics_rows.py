@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
 from surrogate.comparison.measure import distributions, kinetics
-from surrogate.comparison.measure.kinetics import MarkovModel, lagged_eigenvalue, noise_timescale, timescale
+from surrogate.comparison.measure.kinetics import MarkovModel, function_eigenvalue, noise_timescale, timescale
 from surrogate.comparison.measure.slow_motion import slow_torsions, tica_features
 from surrogate.comparison.measure.statistics import (
     BoolArray,
@@ -21,7 +22,7 @@ from surrogate.comparison.measure.statistics import (
     widening,
 )
 from surrogate.comparison.measure.structure import Features
-from surrogate.comparison.rows.charts import ROLES, Chart, Landscape, Line, LineChart, Role, bar_chart
+from surrogate.comparison.rows.charts import ROLES, Chart, Line, LineChart, Role
 from surrogate.comparison.rows.rows import (
     ComparisonInput,
     Measured,
@@ -36,7 +37,7 @@ from surrogate.comparison.rows.rows import (
     series_counts,
 )
 from surrogate.comparison.rows.torsion_rows import squared_turn
-from systems.units import GAS_CONSTANT_KJ_MOL_K, format_time_ps
+from systems.units import format_time_ps
 
 MAX_DRAWN_LAGS = 240
 _LEAST_DRAWN = 50
@@ -44,32 +45,26 @@ _MIN_BOUNDARIES = 20
 _MOST_RELAXING = 6
 _SHARE_OF_WINDOW = 0.85
 _NORMAL_KURTOSIS = 3.0
-_CHECKED_LAGS = 5
 # A process is of every state that carries this share of its variance in the reference.
 _LEAST_SHARE = 0.25
 _DRAWN_LAGS = (0.2, 0.5, 1.0, 2.0, 3.0, 5.0)
-_LANDSCAPE_BINS = 50
-_BAND_DRAWS = 60
 
 
-@dataclass(frozen=True, eq=False)
-class _Correlated:
-    """Autocorrelation `(n_lags,)` of one sample and its integral in frames, with bootstrap draws of the integral
-    `(n_draws,)` and of the curve at some lags `(n_draws, n_kept)`."""
+class _Correlated(NamedTuple):
+    """Autocorrelation of one sample at some lags `(n_kept,)` and its integral in frames, with bootstrap draws of both
+    `(n_draws, n_kept)`, `(n_draws,)`."""
 
     curve: FloatArray
+    draws: FloatArray
     time: float
     draws_time: FloatArray
-    kept: IntArray
-    draws: FloatArray
 
     def band(self) -> tuple[FloatArray, FloatArray]:
-        """Return the 95 % band at the kept lags."""
+        """Return the 95 % band of the curve; NaN where nothing varies."""
         if not np.isfinite(self.draws).any():
-            nothing = np.full(len(self.kept), np.nan)
-            return nothing, nothing
+            return np.full_like(self.curve, np.nan), np.full_like(self.curve, np.nan)
         low, high = np.nanquantile(self.draws, [0.025, 0.975], axis=0) - np.nanmean(self.draws, axis=0)
-        return self.curve[self.kept] + low, self.curve[self.kept] + high
+        return self.curve + low, self.curve + high
 
 
 def turning(features: Features) -> list[tuple[str, str, list[FloatArray]]]:
@@ -112,10 +107,9 @@ def correlation_rows(inputs: ComparisonInput) -> Measured:
         values, draws = [r.time * inputs.lag_ps for r in results], [r.draws_time * inputs.lag_ps for r in results]
         name = f"Relaxation time of {what}, {label}"
         metric = Quantity(f"correlation_time:{label}", "kinetics", name, "ps", 0.2, relative=True)
-        said = speed_words(f"{what} of {label} relaxes")
-        rows.append(observable_row(inputs, metric, values, draws, said))
+        rows.append(observable_row(inputs, metric, values, draws))
         x = kept * inputs.lag_ps
-        reference, candidate, replicate = (r.curve[kept] for r in results)
+        reference, candidate, replicate = (r.curve for r in results)
         lines = (
             Line("", "other", x[[0, -1]], np.zeros(2)),
             Line("reference", "reference", x, reference, *results[0].band()),
@@ -139,7 +133,7 @@ def _correlate(series: Sequence[FloatArray], sample: Sample, n_lags: int, kept: 
     below = np.flatnonzero(~(curve > 0))
     crossing = int(below[0]) if len(below) else n_lags
     draws = _widened(np.concatenate(times), sample.blocks.n_blocks, crossing, series)
-    return _Correlated(curve, float(kinetics.correlation_time(curve)), draws, kept, np.concatenate(values))
+    return _Correlated(curve[kept], np.concatenate(values), float(kinetics.correlation_time(curve)), draws)
 
 
 def _widened(draws: FloatArray, n_blocks: int, crossing: int, series: Sequence[FloatArray]) -> FloatArray:
@@ -174,84 +168,47 @@ def relaxation_of(sample: Sample, k: int = 0) -> tuple[Estimate, Estimate]:
     found = _correlate(series, sample, n_lags, np.array([min(1, n_lags - 1)]))
     lag_ps, n_blocks = sample.features.lag_ps, sample.blocks.n_blocks
     return (
-        estimate(float(found.curve[found.kept[0]]), found.draws[:, 0], n_blocks),
+        estimate(float(found.curve[0]), found.draws[:, 0], n_blocks),
         estimate(found.time * lag_ps, found.draws_time * lag_ps, n_blocks, log=True),
     )
 
 
-def speed_words(what: str) -> Callable[[float, float], str]:
-    """Return what words two times, in ps, of the candidate and the reference."""
-
-    def words(candidate: float, reference: float) -> str:
-        if not math.isfinite(candidate):
-            return f"{what} not at all: it does not move"
-        if candidate <= 0:
-            return f"{what} within one frame (reference {reference:.3g} ps)"
-        if reference <= 0:
-            return f"{what} in {candidate:.3g} ps, the reference within one frame"
-        ratio = reference / candidate
-        speed = f"{ratio:.2g} times too fast" if ratio >= 1 else f"{1 / ratio:.2g} times too slowly"
-        return f"{what} {speed} ({candidate:.3g} ps instead of {reference:.3g} ps)"
-
-    return words
-
-
-def _with_torsions(inputs: ComparisonInput, name: str, lag: int) -> list[list[FloatArray]] | Measured:
-    """Return the features of TICA of each sample, or why there is nothing to fit at this lag (frames)."""
+def slow_rows(inputs: ComparisonInput) -> Measured:
+    """Return rows and charts of TIC 0 and of a Markov state model, both fitted on the reference alone, and what was
+    left out."""
+    lag = max(1, round(inputs.options.tica_lag_ps / inputs.lag_ps))
+    name = f"TICA at a lag of {format_time_ps(lag * inputs.lag_ps)}"
     features = [tica_features(s.features) for s in inputs.samples]
     if not features[0][0].shape[1]:
         return left_out(name, "the scene has no torsion to turn about")
-    short = inputs.too_short(lag)
-    return left_out(name, short) if short else features
-
-
-def tica_rows(inputs: ComparisonInput) -> Measured:
-    """Return rows of TIC 0, fitted on the reference alone (distance, timescale); its histogram; what was skipped."""
-    lag = max(1, round(inputs.options.tica_lag_ps / inputs.lag_ps))
-    lag_ps = lag * inputs.lag_ps
-    name = f"TICA at a lag of {format_time_ps(lag_ps)}"
-    features = _with_torsions(inputs, name, lag)
-    if isinstance(features, Measured):
-        return features
-    model = kinetics.fit_tica(features[0], lag)
-    if model is None:
+    if short := inputs.too_short(lag):
+        return left_out(name, short)
+    projection = kinetics.fit_projection(features[0], lag)
+    if projection is None:
         return left_out(name, kinetics.WITHOUT_TICA)
-    projected = [[model.project(x) for x in segments] for segments in features]
-    bins = distributions.reference_bins(projected[0])
-    counts = series_counts(inputs, projected, bins)
-    rows = [distance_row(inputs, counts, "tic0_jsd", "distributions", "TIC 0 distance", "TIC 0 is")]
-    sums = [kinetics.pair_sums(x, s.blocks, lag) for s, x in zip(inputs.samples, projected, strict=True)]
-    values = [float(timescale(lagged_eigenvalue(own), lag_ps)) for own in sums]
-    noise_ps = inputs.lag_ps * noise_timescale(features[0][0].shape[1], lag, inputs.reference.features.n_frames)
-    skipped: list[Skipped] = []
-    if values[0] < noise_ps:
-        skipped.append((f"Timescale of {name}", "it cannot be told from noise"))
-    else:
-        draws = [timescale(lagged_eigenvalue(x, s.weights), lag_ps) for x, s in zip(sums, inputs.samples, strict=True)]
-        name = f"Timescale of TIC 0 at a lag of {format_time_ps(lag_ps)}"
-        metric = Quantity("tic0_timescale", "kinetics", name, "ps", 0.2, relative=True)
-        rows.append(observable_row(inputs, metric, values, draws, speed_words("the slowest motion (TIC 0) decays")))
-    return Measured(rows, [histogram(inputs, projected, bins, "TIC 0", "")], skipped)
+    coordinates = [[projection.project(x) for x in segments] for segments in features]
+    tic_0 = [[x[:, 0] for x in segments] for segments in coordinates]
+    bins = distributions.reference_bins(tic_0[0])
+    row = distance_row(inputs, series_counts(inputs, tic_0, bins), "tic0_jsd", "distributions", "TIC 0 distance")
+    rows, charts, skipped = _markov_model(inputs, coordinates, lag)
+    return Measured([row, *rows], [histogram(inputs, tic_0, bins, "TIC 0", ""), *charts], skipped)
 
 
 def boundary_row(inputs: ComparisonInput) -> Measured:
-    """Return the row that shows seams: the step of all torsions where a chunk begins, over that inside chunks."""
+    """Return the row that shows seams: the step of phi and psi where a chunk begins, over that inside chunks."""
     name = "Steps across chunk boundaries"
     sample, features = inputs.candidate, inputs.candidate.features
-    if features.chunk_idx is None or not any((c >= 0).any() for c in features.chunk_idx):
-        return left_out(name, "the candidate's file marks no chunks")
-    if not (len(inputs.torsions.phi) or len(inputs.torsions.psi)):
-        return left_out(name, "the scene has no φ or ψ torsion")
+    if features.chunk_idx is None or not (len(inputs.torsions.phi) or len(inputs.torsions.psi)):
+        return left_out(name, "the candidate's file marks no chunks, or the scene has no φ or ψ torsion")
+    # Squared steps and how many, at seams and within chunks.
     sums = np.zeros((4, sample.blocks.n_blocks))
     for piece in sample.blocks.pieces:
-        phi, psi, chunk = (
-            series[piece.segment][piece.start : piece.stop]
-            for series in (features.phi, features.psi, features.chunk_idx)
-        )
+        series = (features.phi, features.psi, features.chunk_idx)
+        phi, psi, chunk = (x[piece.segment][piece.start : piece.stop] for x in series)
         squared = squared_turn(np.concatenate([phi, psi], axis=1))
-        at_seam = (chunk[1:] != chunk[:-1]) & np.isfinite(squared)
-        within = (chunk[1:] == chunk[:-1]) & np.isfinite(squared)
-        sums[:, piece.block] += (squared[at_seam].sum(), at_seam.sum(), squared[within].sum(), within.sum())
+        seam, known = chunk[1:] != chunk[:-1], np.isfinite(squared)
+        for k, of in enumerate((seam & known, ~seam & known)):
+            sums[2 * k : 2 * k + 2, piece.block] += squared[of].sum(), of.sum()
     total = sums.sum(1)
     if total[1] < _MIN_BOUNDARIES or not total[3]:
         return left_out(name, f"fewer than {_MIN_BOUNDARIES} boundaries, or no two frames in one chunk")
@@ -286,7 +243,6 @@ class _States:
 
     sample: Sample
     role: Role
-    coordinates: list[FloatArray]
     micro: list[IntArray]
     macro: list[IntArray]
     occupancy: FloatArray
@@ -304,40 +260,27 @@ def _square(counts: FloatArray) -> FloatArray:
     return counts.reshape(n, n)
 
 
-def msm_rows(inputs: ComparisonInput) -> Measured:
+def _markov_model(inputs: ComparisonInput, coordinates: Sequence[list[FloatArray]], lag: int) -> Measured:
     """Return the rows and charts of a Markov state model fitted on the reference, and why there are none."""
-    lag = max(1, round(inputs.options.tica_lag_ps / inputs.lag_ps))
     lag_ps = lag * inputs.lag_ps
     name = f"Markov state model at a lag of {format_time_ps(lag_ps)}"
-    features = _with_torsions(inputs, name, lag)
-    if isinstance(features, Measured):
-        return features
-    projection = kinetics.fit_projection(features[0], lag)
-    if projection is None:
-        return left_out(name, kinetics.WITHOUT_TICA)
-    coordinates = [[projection.project(x) for x in segments] for segments in features]
     model = kinetics.fit_model(coordinates[0], lag)
     if model is None:
         return left_out(name, "the reference visits too few states, or none that hold together")
     noise_ps = inputs.lag_ps * noise_timescale(len(model.centres), lag, inputs.reference.features.n_frames)
     if not len(model.timescales) or inputs.lag_ps * model.timescales[0] < noise_ps:
-        return left_out(name, "its slowest process cannot be told from noise")
+        return left_out(name, "its slowest process may be noise")
     states = [_states(model, s, r, x) for s, r, x in zip(inputs.samples, ROLES, coordinates, strict=True)]
     names = state_names(inputs, states[0].macro, model.n_states)
     metric = f"Populations of {model.n_states} metastable states, distance"
-    what = "the metastable states are"
-    rows = [distance_row(inputs, [s.occupancy for s in states], "msm_jsd", "distributions", metric, what)]
+    rows = [distance_row(inputs, [s.occupancy for s in states], "msm_jsd", "distributions", metric)]
     timescales, skipped = _timescale_rows(inputs, model, states, names, noise_ps)
     if all(s.transitions.sum() for s in states):
         metric = f"Transitions between metastable states within {format_time_ps(lag_ps)}, distance"
-        what, counts = "transitions between states are", [s.transitions for s in states]
-        rows.append(distance_row(inputs, counts, "transition_jsd", "kinetics", metric, what))
+        rows.append(distance_row(inputs, [s.transitions for s in states], "transition_jsd", "kinetics", metric))
     else:
         skipped.append(("Transitions between metastable states", "one of the trajectories is in none of them"))
-    charts: list[Chart] = [*_landscape(states), _free_energies(inputs, states, names)]
-    charts += [_check_chart(inputs, model, s) for s in states[:2]]
-    charts.append(_timescale_chart(inputs, model, states, names))
-    return Measured([*rows, *timescales], charts, skipped)
+    return Measured([*rows, *timescales], [_timescale_chart(inputs, model, states, names)], skipped)
 
 
 def _states(model: MarkovModel, sample: Sample, role: Role, coordinates: list[FloatArray]) -> _States:
@@ -348,7 +291,7 @@ def _states(model: MarkovModel, sample: Sample, role: Role, coordinates: list[Fl
         for labels, n in ((macro, model.n_states), (micro, len(model.centres)))
     )
     occupancy = kinetics.state_counts(macro, sample.blocks, model.n_states)
-    return _States(sample, role, coordinates, micro, macro, occupancy, transitions, micro_counts)
+    return _States(sample, role, micro, macro, occupancy, transitions, micro_counts)
 
 
 def state_names(inputs: ComparisonInput, macro: Sequence[IntArray], n_states: int) -> list[str]:
@@ -395,101 +338,38 @@ def _timescale_rows(
             where = _named(names, missing)
             skipped.append((name, f"the candidate never stays in {where}, into which this process leads"))
             continue
-        sums = [kinetics.function_sums(s.micro_counts, function) for s in states]
-        values = [float(timescale(lagged_eigenvalue(own), lag)) for own in sums]
+        values = [float(timescale(function_eigenvalue(s.micro_counts, function), lag)) for s in states]
         if values[0] < noise_ps:
-            skipped.append((name, f"{values[0]:.2g} ps: cannot be told from noise at this lag"))
+            skipped.append((name, f"{values[0]:.2g} ps: may be noise at this lag"))
             continue
-        draws = [timescale(lagged_eigenvalue(own, s.sample.weights), lag) for own, s in zip(sums, states, strict=True)]
+        draws = [timescale(function_eigenvalue(s.micro_counts, function, s.sample.weights), lag) for s in states]
         if missing_in_replicate.any():
             values[2], draws[2] = math.nan, np.full_like(draws[2], np.nan)
         metric = Quantity(f"msm_timescale:{k}", "kinetics", name, "ps", 0.2, relative=True)
-        said = speed_words(f"process {k} of the Markov state model decays")
-        rows.append(observable_row(inputs, metric, values, draws, said))
+        rows.append(observable_row(inputs, metric, values, draws))
     return rows, skipped
-
-
-def _landscape(states: Sequence[_States]) -> list[Chart]:
-    reference = states[0].coordinates
-    if reference[0].shape[1] < 2:
-        return []
-    x, y = (distributions.reference_bins([c[:, k] for c in reference], _LANDSCAPE_BINS).edges for k in range(2))
-
-    def counts(s: _States) -> FloatArray:
-        found = np.concatenate(s.coordinates)
-        found = found[np.isfinite(found).all(axis=1)]
-        return np.asarray(np.histogram2d(found[:, 0], found[:, 1], bins=[x, y])[0])
-
-    ref, cand, rep = map(counts, states)
-    return [Landscape("distributions", "TICA landscape", "TIC 0", "TIC 1", x, y, ref, cand, rep)]
-
-
-def _free_energies(inputs: ComparisonInput, states: Sequence[_States], names: Sequence[str]) -> Chart:
-    """Free energies of the states above the most populated one, -RT ln(p / p_0), with error bars; no row rests on
-    them."""
-    thermal_kj = GAS_CONSTANT_KJ_MOL_K * inputs.temperature_k
-    found = []
-    for s in states:
-        total, drawn = s.occupancy.sum(0), s.sample.weights @ s.occupancy
-        with np.errstate(divide="ignore", invalid="ignore"):
-            value = -thermal_kj * np.log(total[1:-1] / total[0])
-            draws = -thermal_kj * np.log(drawn[:, 1:-1] / drawn[:, :1])
-        found.append([estimate(float(v), draws[:, k], s.sample.blocks.n_blocks) for k, v in enumerate(value)])
-    title = "Free energies of the metastable states"
-    caption = f"Above {names[0]}, at {inputs.temperature_k:g} K: -RT ln of the ratio of populations, 95 % intervals."
-    return bar_chart("distributions", title, caption, "ΔG / kJ/mol", names[1:], found)
-
-
-def _check_chart(inputs: ComparisonInput, model: MarkovModel, s: _States) -> Chart:
-    """Does the model of one lag predict the next four? Circles of the estimate on lines of the prediction."""
-    n = model.n_states
-    longest = max(s.sample.features.segment_lengths)
-    steps = [i for i in range(1, _CHECKED_LAGS + 1) if 2 * i * model.lag_frames < longest]
-    counts = [kinetics.block_transitions(s.macro, s.sample.blocks, n, i * model.lag_frames).sum(0) for i in steps]
-    predicted, estimated = kinetics.chapman_kolmogorov([_square(c) for c in counts])
-    gap = float(np.nanmax(np.abs(predicted - estimated))) if np.isfinite(estimated).any() else math.nan
-    x = np.array(steps) * (model.lag_frames * inputs.lag_ps)
-    lines = [Line(f"state {k + 1}, observed", s.role, x, estimated[:, k]) for k in range(n)]
-    lines += [Line(f"state {k + 1}, predicted", "other", x, predicted[:, k]) for k in range(n)]
-    caption = (
-        "Probability to be in the state one started in: observed, and predicted from the shortest lag by a "
-        f"Markov chain of the metastable states. Largest difference {gap:.2g}."
-    )
-    title, y_label = f"Chapman-Kolmogorov test, {s.role}", "probability to be back"
-    return LineChart("kinetics", title, caption, "lag / ps", y_label, tuple(lines))
 
 
 def _timescale_chart(
     inputs: ComparisonInput, model: MarkovModel, states: Sequence[_States], names: Sequence[str]
 ) -> Chart:
-    """Implied timescales against the lag they were estimated at: level where the model is Markovian.
-
-    Of what never stays in one of the states there is one process less.
-    """
+    """Implied timescales against the lag they were estimated at: level where the model is Markovian. Of what never
+    stays in one of the states there is one process less."""
     n_micro, n_slow = len(model.centres), model.n_states - 1
     longest = min(max(s.sample.features.segment_lengths) for s in states)
     lags = sorted({max(1, round(f * model.lag_frames)) for f in _DRAWN_LAGS})
     lags = [lag for lag in lags if 10 * lag <= longest]
     lines = []
-    caption = "Of the Markov state model against the lag it is estimated at; states are those of the reference; bands "
-    caption += "hold 95 % of bootstrap draws."
+    caption = "Of the Markov state model against the lag it is estimated at; states are those of the reference."
     for s in states:
         missing = s.never_held()
         if missing.any():
             caption += f" The {s.role} never stays in {_named(names, missing)}, and has so many processes less."
-        times, drawn = [], []
-        for lag in lags:
-            per_block = kinetics.block_transitions(s.micro, s.sample.blocks, n_micro, lag)
-            found = [
-                kinetics.slow_functions(_square(c), n_slow)[0]
-                for c in (per_block.sum(0), *(s.sample.weights[:_BAND_DRAWS] @ per_block))
-            ]
-            of_lag = timescale(np.array(found), lag * inputs.lag_ps)
-            times.append(of_lag[0])
-            drawn.append(np.nanquantile(of_lag[1:], [0.025, 0.975], axis=0))
-        table, bands, x = np.array(times), np.array(drawn), np.array(lags) * inputs.lag_ps
+        counts = [kinetics.block_transitions(s.micro, s.sample.blocks, n_micro, lag).sum(0) for lag in lags]
+        values = [kinetics.slow_functions(_square(c), n_slow)[0] for c in counts]
+        times = np.array([timescale(v, lag * inputs.lag_ps) for v, lag in zip(values, lags, strict=True)])
         lines += [
-            Line(f"{s.role}, process {k + 1}", s.role, x, table[:, k], bands[:, 0, k], bands[:, 1, k])
+            Line(f"{s.role}, process {k + 1}", s.role, np.array(lags) * inputs.lag_ps, times[:, k])
             for k in range(n_slow - int(missing.sum()))
         ]
     title, y_label = "Implied timescales", "timescale / ps"

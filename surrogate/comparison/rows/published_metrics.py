@@ -5,60 +5,32 @@ natural logarithm; torsions in 100 bins on [-pi, pi]; TICA of cos and sin of all
 map, fitted on the reference; TIC 0 in 100 bins and TIC 0, 1 in 50 x 50 over the union of both ranges; k-means with 100
 clusters, a Markov state model at 100 ps, PCCA to 10 states, and the occupancies of these. It differs from our own
 metrics in its ranges: no overflow bins, frames that are not finite are left out.
-
-The forecast error of paired trajectories (ADE and FDE as in EGNO, EqMotion and LaM-SLidE): how far from the reference's
-atoms the candidate's are, against time. Segments are paired in order, where both start from the same frame or frames;
-nothing else can be called a forecast. Beside the candidate stand the replicate, where it starts there too, the last
-shared frame held still, and the last shared step repeated for ever.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
 from surrogate.comparison.measure import distributions, kinetics
 from surrogate.comparison.measure.slow_motion import tica_features
-from surrogate.comparison.measure.statistics import Blocks, FloatArray, Segments
+from surrogate.comparison.measure.statistics import Blocks, Estimate, FloatArray, Segments
 from surrogate.comparison.measure.structure import Features
-from surrogate.comparison.read.ensemble import Ensemble
-from surrogate.comparison.rows.charts import ROLES, BarChart, Chart, Line, LineChart, Role
+from surrogate.comparison.rows.charts import ROLES, Line, LineChart, bar_chart
 from surrogate.comparison.rows.rows import ComparisonInput, Measured, left_out
-from systems.chemistry.geometry import superposition
 from systems.units import format_time_ps
 
 LAG_PS = 100.0
 N_CLUSTERS = 100
 N_STATES = 10
 N_BINS, N_BINS_JOINT = 100, 50
-# The first frames are the same within what any format rounds to; further ones are shared, and not forecast very well,
-# within single precision.
-SAME_NM, SHARED_NM = 1e-3, 2e-5
-MAX_GIVEN, MAX_HORIZON, MAX_PAIRS = 64, 1000, 200
+# The columns of the published table.
+TABLE = ("backbone torsions", "side-chain torsions", "all torsions", "TICA 0", "TICA 0,1", "MSM states")
 
 
-@dataclass(frozen=True)
-class PeptideTable:
-    """The columns of the published table, distances to the reference; NaN where there is nothing to average over."""
-
-    backbone: float
-    side_chain: float
-    all_torsions: float
-    tica_0: float
-    tica_01: float
-    msm: float
-
-    NAMES = ("backbone torsions", "side-chain torsions", "all torsions", "TICA 0", "TICA 0,1", "MSM states")
-
-    def values(self) -> FloatArray:
-        """Return the six numbers in the order of `NAMES`."""
-        return np.array([self.backbone, self.side_chain, self.all_torsions, self.tica_0, self.tica_01, self.msm])
-
-
-@dataclass(frozen=True, eq=False)
-class Fit:
+class Fit(NamedTuple):
     """What the recipe fits on the reference: the TICA projection, and the states or None where there are too few."""
 
     projection: kinetics.Projection
@@ -93,8 +65,9 @@ def fit_recipe(reference: Features, *, n_clusters: int = N_CLUSTERS, n_states: i
     return Fit(projection, kinetics.fit_model(coordinates, lag, n_clusters, n_states), coordinates)
 
 
-def peptide_table(fit: Fit, reference: Features, other: Features) -> PeptideTable:
-    """Return the recipe's distances between the reference, on which `fit` was made, and another trajectory."""
+def peptide_table(fit: Fit, reference: Features, other: Features) -> FloatArray:
+    """Return the recipe's distances `(6,)`, those of `TABLE`, between the reference, on which `fit` was made, and
+    another trajectory; NaN where there is nothing to average over."""
     backbone, side = (
         [histogram_distance(p, q, -math.pi, math.pi) for p, q in zip(ours, theirs, strict=True)]
         for ours, theirs in zip(torsion_columns(reference), torsion_columns(other), strict=True)
@@ -103,6 +76,7 @@ def peptide_table(fit: Fit, reference: Features, other: Features) -> PeptideTabl
     whole = [np.concatenate(x) for x in (fit.coordinates, theirs)]
     p, q = (x[np.isfinite(x).all(axis=1)] for x in whole)
     low, high = np.minimum(p.min(0), q.min(0)), np.maximum(p.max(0), q.max(0))
+    tica_0 = histogram_distance([p[:, 0]], [q[:, 0]], float(low[0]), float(high[0]))
     tica_01 = states = math.nan
     if p.shape[1] > 1:
         box = [(low[0], high[0]), (low[1], high[1])]
@@ -113,8 +87,7 @@ def peptide_table(fit: Fit, reference: Features, other: Features) -> PeptideTabl
         counts = [np.bincount(x[x >= 0], minlength=fit.model.n_states).astype(float) for x in labels]
         states = float(distributions.distance(counts[0], counts[1]))
     means = [float(np.mean(x)) if x else math.nan for x in (backbone, side, backbone + side)]
-    tica_0 = histogram_distance([p[:, 0]], [q[:, 0]], float(low[0]), float(high[0]))
-    return PeptideTable(means[0], means[1], means[2], tica_0, tica_01, states)
+    return np.array([*means, tica_0, tica_01, states])
 
 
 def decorrelation(segments: Segments, n_lags: int) -> FloatArray:
@@ -159,22 +132,22 @@ def peptide_charts(inputs: ComparisonInput) -> Measured:
     fit: Fit | None = inputs.recipes[n]
     if fit is None:
         return left_out(name, kinetics.WITHOUT_TICA)
-    candidate, replicate = (peptide_table(fit, reference, other).values() for other in others)
+    candidate, replicate = (peptide_table(fit, reference, other) for other in others)
     known = np.isfinite(replicate)
     n_states = "none" if fit.model is None else str(fit.model.n_states)
     caption = (
         "Jensen-Shannon distances to the reference (natural logarithm), as MDGen, JAMUN and LaM-SLidE print them: 100 "
         f"and 50 × 50 bins, TICA and MSM at 100 ps, 100 clusters, {n_states} metastable states. Not evaluated."
     )
-    names = tuple(n for n, k in zip(PeptideTable.NAMES, known, strict=True) if k)
-    numbers = np.zeros(int(known.sum())), candidate[known], replicate[known]
+    names = tuple(n for n, k in zip(TABLE, known, strict=True) if k)
+    numbers = [np.zeros(len(names)), candidate[known], replicate[known]]
+    made = [[Estimate(x) for x in own.tolist()] for own in numbers]
     title, y_label = "By the peptide papers' recipe", "distance to the reference"
-    return Measured(
-        charts=[BarChart("distributions", title, caption, y_label, names, *numbers), _decorrelation_chart(inputs)]
-    )
+    table = bar_chart("distributions", title, caption, y_label, names, made)
+    return Measured(charts=[table, _decorrelation_chart(inputs)])
 
 
-def _decorrelation_chart(inputs: ComparisonInput) -> Chart:
+def _decorrelation_chart(inputs: ComparisonInput) -> LineChart:
     n_lags = min(int(10 * LAG_PS / inputs.lag_ps), max(inputs.reference.features.segment_lengths)) + 1
     drawn = np.unique(np.geomspace(1, n_lags - 1, 80).astype(int))
     lines = []
@@ -188,127 +161,3 @@ def _decorrelation_chart(inputs: ComparisonInput) -> Chart:
     title = "Decorrelation of torsions, by the peptide papers' recipe"
     caption = "Mean over torsions of (<sin sin'> + <cos cos'> - baseline) / (1 - baseline), not demeaned."
     return LineChart("kinetics", title, caption, "lag / ps", "decorrelation", tuple(lines), log_x=True)
-
-
-@dataclass(frozen=True, eq=False)
-class Forecast:
-    """Mean distance over atoms in nm, `(n_pairs, n_times)`, at each frame after the `n_given` that both share."""
-
-    name: str
-    role: Role
-    distance_nm: FloatArray
-
-    def final(self) -> FloatArray:
-        """Return the FDE `(n_times,)` in Å of a forecast that ends at each time: the mean over pairs."""
-        return np.asarray(10.0 * self.distance_nm.mean(axis=0))
-
-    def average(self) -> FloatArray:
-        """Return the ADE `(n_times,)` in Å of a forecast that ends at each time: the mean over all frames up to it."""
-        return np.asarray(self.final().cumsum() / np.arange(1, self.distance_nm.shape[1] + 1))
-
-
-@dataclass(frozen=True, eq=False)
-class Pairs:
-    """Frames of paired segments `(n_pairs, n_given + n_times, n_atoms, 3)` nm, the second laid on the first's start."""
-
-    ref: FloatArray
-    forecast: FloatArray
-    n_given: int
-
-
-def find_pairs(reference: Ensemble, other: Ensemble) -> Pairs | None:
-    """Return the segments that start from the same frames, paired in order; None where the first ones do not.
-
-    Each segment of `other` is moved rigidly, as a whole, so that its first frame lies on the reference's.
-    """
-    found: list[tuple[FloatArray, FloatArray]] = []
-    for k in range(min(len(reference.segments), len(other.segments), MAX_PAIRS)):
-        most = min(len(reference.segments[k]), len(other.segments[k]), MAX_GIVEN + MAX_HORIZON)
-        first, start = (np.asarray(e.segments[k][:1], dtype=np.float64) for e in (reference, other))
-        if most < 2 or not (np.isfinite(first).all() and np.isfinite(start).all()):
-            break
-        # The same but for a rigid motion.
-        if np.abs(_laid(start, first[0]) - first).max() >= SAME_NM:
-            break
-        ref, forecast = (np.asarray(e.segments[k][:most], dtype=np.float64) for e in (reference, other))
-        found.append((ref, _laid(forecast, ref[0])))
-    if not found:
-        return None
-    length = min(len(ref) for ref, _ in found)
-    ref, forecast = (np.stack([pair[i][:length] for pair in found]) for i in (0, 1))
-    near = (np.abs(ref - forecast).max(axis=(2, 3)) < SHARED_NM).all(axis=0)
-    n_given = length if near.all() else max(int(np.argmin(near)), 1)
-    return Pairs(ref, forecast, n_given) if n_given < length and n_given <= MAX_GIVEN else None
-
-
-def forecasts(pairs: Pairs, role: Role = "candidate") -> list[Forecast]:
-    """Return the errors of the forecast itself, of the frozen frame, and of constant velocity (two shared frames).
-
-    Definition: mean L2 distance over atoms, as in EGNO, EqMotion and LaM-SLidE (Tables of MD17).
-    """
-    g = pairs.n_given
-    ref, last = pairs.ref[:, g:], pairs.ref[:, g - 1 : g]
-    out = [Forecast(role, role, _distance(ref, pairs.forecast[:, g:]))]
-    if role == "candidate":
-        out.append(Forecast("frozen frame", "other", _distance(ref, last)))
-        if g >= 2:
-            step = last - pairs.ref[:, g - 2 : g - 1]
-            ahead = np.arange(1, ref.shape[1] + 1)[None, :, None, None]
-            out.append(Forecast("constant velocity", "other", _distance(ref, last + ahead * step)))
-    return out
-
-
-def forecast_charts(inputs: ComparisonInput) -> Measured:
-    """Return charts of FDE and ADE against time of the candidate's pairs and the replicate's, or why there are none."""
-    if inputs.trajectories is None:
-        return Measured()
-    reference, candidate, replicate = inputs.trajectories
-    pairs = find_pairs(reference, candidate)
-    if pairs is None:
-        why = "the reference and the candidate do not start from the same frame, or never part"
-        return left_out("Forecast error (ADE, FDE)", why)
-    beside = None if replicate is None else find_pairs(reference, replicate)
-    found = forecasts(pairs) + ([] if beside is None else forecasts(beside, "replicate"))
-    n_times = min(f.distance_nm.shape[1] for f in found)
-    time_ps = reference.lag_ps * np.arange(1, n_times + 1)
-    said = "; ".join(f"{f.name} {f.average()[n_times - 1]:.3g} and {f.final()[n_times - 1]:.3g} Å" for f in found)
-    caption = (
-        f"{len(pairs.ref)} pairs over {format_time_ps(float(time_ps[-1]))} after {pairs.n_given} shared frames. Mean "
-        f"distance of all atoms; ADE and FDE at the end: {said}."
-    )
-    at = tuple(_line(f, time_ps, f.final()[:n_times], banded=True) for f in found)
-    up_to = tuple(_line(f, time_ps, f.average()[:n_times], banded=False) for f in found)
-    return Measured(
-        charts=[
-            LineChart("forecast", title, caption, "time / ps", "error / Å", lines, log_x=n_times > 3, log_y=True)
-            for title, lines in (("Forecast error at a time (FDE)", at), ("Forecast error up to a time (ADE)", up_to))
-        ]
-    )
-
-
-def _line(found: Forecast, time_ps: FloatArray, values: FloatArray, *, banded: bool) -> Line:
-    n = len(found.distance_nm)
-    y = np.where(values > 0, values, np.nan)
-    if not banded or n < 3:
-        return Line(found.name, found.role, time_ps, y)
-    half = 10.0 * 1.96 * found.distance_nm[:, : len(y)].std(axis=0, ddof=1) / math.sqrt(n)
-    low = np.where(y > half, y - half, y)
-    return Line(found.name, found.role, time_ps, y, low, y + half)
-
-
-def _laid(frames: FloatArray, start: FloatArray) -> FloatArray:
-    """Return frames `(n, n_atoms, 3)` moved rigidly, all alike, so that the first lies on `start` `(n_atoms, 3)`.
-
-    Where it lies there already nothing is moved: a rotation of a straight or single-atom scene would be arbitrary.
-    """
-    if np.abs(frames[0] - start).max() < SAME_NM:
-        return frames
-    rotation, translation = superposition(frames[:1], start)
-    return np.asarray(np.einsum("ij,tnj->tni", rotation[0], frames) + translation[0])
-
-
-def _distance(ref: FloatArray, forecast: FloatArray) -> FloatArray:
-    """Mean distance over atoms `(n_pairs, n_times)` nm; frames that are not finite are infinitely far."""
-    with np.errstate(invalid="ignore", over="ignore"):
-        gap = np.linalg.norm(forecast - ref, axis=-1).mean(axis=-1)
-    return np.where(np.isfinite(gap), gap, np.inf)

@@ -4,11 +4,12 @@ of a distance between histograms, of a number that each trajectory has by itself
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 
 from surrogate.comparison.measure import distributions
 from surrogate.comparison.measure.distributions import Bins
@@ -25,9 +26,8 @@ from surrogate.comparison.measure.statistics import (
     permutation_p,
     pooled,
 )
-from surrogate.comparison.measure.structure import Backbone, Family, Features, Groups, over_groups
-from surrogate.comparison.read.ensemble import Ensemble
-from surrogate.comparison.rows.charts import Chart, Histogram, jsonable
+from surrogate.comparison.measure.structure import Backbone, Family, Features, Groups, Probes, over_groups
+from surrogate.comparison.rows.charts import Chart, Histogram, Section
 from systems.chemistry.validity import Geometry
 from systems.scene import Scene
 from systems.units import GAS_CONSTANT_KJ_MOL_K, format_time_ps
@@ -56,11 +56,8 @@ GROUPS: tuple[Group, ...] = ("validity", "structure", "populations", "distributi
 
 @dataclass(frozen=True)
 class Options:
-    """Settings of a comparison. `tica_lag_ps` is rounded to whole frames, which the rows then name.
-
-    `peptide_recipe`: whether the published recipe is followed too (its 10 states take most of the time of a short
-    comparison, and no verdict rests on it).
-    """
+    """Settings of a comparison. `tica_lag_ps` is rounded to whole frames. `peptide_recipe`: whether the published
+    recipe is followed too (it takes most of the time of a short comparison, and no verdict rests on it)."""
 
     tica_lag_ps: float = 10.0
     n_bootstrap: int = 400
@@ -77,7 +74,7 @@ class Quantity:
     `tolerance` is in `unit`; of a positive, skewed number, such as a time or a width (`relative`), it is a share of the
     reference's value, and logarithms are compared. `tolerance_text` says it where that takes other words. A difference
     below `resolution`, in `unit`, is not a physical one (rounding of files, tolerance of constraint solvers) and never
-    significant. Numbers in % are shares: their intervals end at 0 and 100.
+    significant. Numbers in % are shares: their intervals end at 0 and 100. `hint` ends the words for a deviation.
     """
 
     key: str
@@ -88,10 +85,20 @@ class Quantity:
     tolerance_text: str = ""
     relative: bool = False
     resolution: float = 0.0
+    hint: str = ""
 
     def tolerance_words(self) -> str:
         """Return such as '0.4 Hz', or '20 %' of a relative one."""
         return f"{100 * self.tolerance:g} %" if self.relative else f"{self.tolerance:g} {self.unit}".rstrip()
+
+    def deviation(self, candidate: float, reference: float, where: str = "") -> str:
+        """Return such as 'radius of gyration, mean: 3.1 Å instead of 3.4 Å'."""
+        name = lower_first(self.name) + (f", {where}" if where else "")
+        if not math.isfinite(candidate):
+            return f"{name}: it does not move"
+        digits = 3 if f"{candidate:.3g}" != f"{reference:.3g}" else 5
+        shown = (f"{x:.{digits}g}{'' if self.unit == '°' else ' '}{self.unit}".rstrip() for x in (candidate, reference))
+        return f"{name}: {' instead of '.join(shown)}{self.hint}"
 
 
 Skipped = tuple[str, str]
@@ -114,11 +121,11 @@ def left_out(name: str, why: str) -> Measured:
 class Row:
     """One metric of one candidate, between the reference and its replicate.
 
-    `form` says how it is evaluated: a "distance" to the reference stands beside the replicate's, and `ratio` is to that
-    replicate baseline; an "observable" is compared with the reference's own value, and `ratio` is to that; a "share" is
-    the part of frames that pass a check. `statement` puts the deviation in words. `p_value` tests the candidate against
-    reference and replicate together, `p_replicate` the replicate against the reference; `p_corrected` is Holm's over
-    all rows. `kind` and `time_scale` are those of the `Metric` that measured it.
+    `form`: a "distance" to the reference is compared with the replicate's, and `ratio` is to that; an "observable" is
+    compared with the reference's own value, and `ratio` is to that; a "share" is the part of frames that pass a check.
+    `statement` puts the deviation in words. `p_value` tests the candidate against reference and replicate together,
+    `p_replicate` the replicate against the reference; `p_corrected` is Holm's over all rows. `kind` and `time_scale`
+    are those of the `Metric` that measured it.
     """
 
     key: str
@@ -141,18 +148,12 @@ class Row:
     kind: Kind = "distribution"
     time_scale: TimeScale = "slow"
 
-    def to_dict(self) -> dict[str, Any]:
-        """Return JSON-able values; what is not finite becomes None."""
-        return {name: jsonable(value) for name, value in vars(self).items()}
-
 
 @dataclass(frozen=True, eq=False)
 class Sample:
-    """One ensemble as it enters the statistics: features, their blocks, bootstrap weights `(n_draws, n_blocks)`.
-
-    Tests use all blocks. What depends on the length itself (a histogram's distance, the replicate baseline) uses the
-    first `n_equal` blocks alone, which are as long as those of the other trajectories.
-    """
+    """One ensemble as it enters the statistics: features, their blocks, bootstrap weights `(n_draws, n_blocks)`. Tests
+    use all blocks; what depends on the length itself (a histogram's distance, the replicate baseline) the first
+    `n_equal` alone, which are as long as those of the other trajectories."""
 
     features: Features
     blocks: Blocks
@@ -169,11 +170,8 @@ class Sample:
 @dataclass(frozen=True, eq=False)
 class ComparisonInput:
     """Reference, candidate and replicate at equal lag and equal frame count, and what they are measured with.
-
-    `recipes`: what the published recipe fitted on the reference, by the number of its frames; the candidates of one
-    comparison share it. `trajectories`: reference, candidate and replicate (None where there is none) whole, as they
-    were read.
-    """
+    `recipes`: what the published recipe fitted on the reference, by the number of its frames; the candidates share
+    it."""
 
     scene: Scene
     torsions: Backbone
@@ -184,7 +182,12 @@ class ComparisonInput:
     options: Options
     temperature_k: float = 300.0
     recipes: dict[int, Any] = field(default_factory=dict)
-    trajectories: tuple[Ensemble, Ensemble, Ensemble | None] | None = None
+
+    @property
+    def probes(self) -> Probes:
+        """What is measured beside phi, psi, bonds and validity."""
+        assert self.reference.features.probes is not None
+        return self.reference.features.probes
 
     @property
     def lag_ps(self) -> float:
@@ -224,9 +227,7 @@ def make_sample(
     features: Features, blocks: Blocks, options: Options, stream: int, n_equal_frames: int | None = None
 ) -> Sample:
     """Return a sample with its own stream of bootstrap draws, so that adding a candidate changes no other number.
-
-    `n_equal_frames`: the length that all trajectories of the comparison have; None for the whole.
-    """
+    `n_equal_frames`: the length that all trajectories of the comparison have; None for the whole."""
     rng = np.random.default_rng([options.seed, stream])
     n = blocks.n_blocks
     if n_equal_frames is not None and n_equal_frames < features.n_frames:
@@ -252,16 +253,14 @@ def distance_row(
     key: str,
     group: Group,
     metric: str,
-    what: str,
     strata: Sequence[IntArray] | None = None,
 ) -> Row:
-    """Return the row of a Jensen-Shannon distance from histograms per block of (reference, candidate, replicate).
+    """Return the row of a Jensen-Shannon distance from histograms per block of (reference, candidate, replicate): three
+    arrays `(n_blocks, n_bins)`, or `(n_blocks, n_series, n_bins)` whose distances are averaged.
 
-    `counts`: three arrays `(n_blocks, n_bins)`, or `(n_blocks, n_series, n_bins)` whose distances are averaged. `what`
-    begins the sentence that words the deviation: '... so many times as far off as a replicate's'. Distances are those
-    of equal lengths; the p-values are block permutation tests of everything there is. A replicate that differs from the
-    reference does not speak for it: the candidate is then tested against the reference alone. `strata`: the kind of
-    each block of the three; only blocks of one kind are exchanged.
+    Distances are those of equal lengths; the p-values are block permutation tests of everything there is, against the
+    reference alone where the replicate differs from it. `strata`: the kind of each block; only blocks of one kind are
+    exchanged.
     """
     ref, cand, rep = (c.reshape(len(c), -1, c.shape[-1]) for c in counts)
     # Bins that nobody visits add nothing to any distance.
@@ -273,30 +272,47 @@ def distance_row(
         shape = (len(p), n_series, n_bins)
         return np.asarray(distributions.distance(p.reshape(shape), q.reshape(shape)).mean(-1))
 
+    # Of what is equally long: both distances, and their bootstrap draws.
     equal = [c[: s.n_equal] for s, c in zip(inputs.samples, flat, strict=True)]
     sums = [c.sum(0)[None] for c in equal]
-    to_candidate, to_replicate = float(mean_distance(sums[0], sums[1])[0]), float(mean_distance(sums[0], sums[2])[0])
-    draws_candidate, draws_replicate = _drawn_distances(inputs, equal, mean_distance)
+    to_candidate, to_replicate = (float(mean_distance(sums[0], x)[0]) for x in sums[1:])
+    batch = max(1, int(_DRAWN_VALUES // max(n_series * n_bins, 1)))
+    drawn = []
+    for start in range(0, inputs.options.n_bootstrap, batch):
+        own, theirs, others = (
+            s.equal_weights[start : start + batch] @ x for s, x in zip(inputs.samples, equal, strict=True)
+        )
+        drawn.append((mean_distance(own, theirs), mean_distance(own, others)))
+    draws_candidate, draws_replicate = map(np.concatenate, zip(*drawn, strict=True))
     n_blocks = min(len(c) for c in equal)
     ratio = Estimate(math.nan)
     if to_replicate > 0:
         with np.errstate(invalid="ignore", divide="ignore"):
             ratio = estimate(to_candidate / to_replicate, draws_candidate / draws_replicate, n_blocks, log=True)
-    p, p_replicate = _permutation_pair(inputs, flat, mean_distance, strata)
-    words = f"{what} {ratio.value:.2g} times as far off as a replicate's"
+    rng = np.random.default_rng([inputs.options.seed, 99])
+    strata = strata or [np.zeros(len(c), dtype=np.int64) for c in flat]
+
+    def p_of(other: int, *sources: int) -> float:
+        of_block = np.concatenate([strata[k] for k in (*sources, other)])
+        pool = np.concatenate([flat[k] for k in sources])
+        return permutation_p(pool, flat[other], mean_distance, rng, inputs.options.n_permutations, of_block)
+
+    p_replicate = p_of(2, 0)
+    p = p_of(1, 0) if p_replicate < UNLIKE_BELOW else p_of(1, 0, 2)
+    words = f"{ratio.value:.2g} times a replicate's" if math.isfinite(ratio.value) else "not as in the reference"
     return Row(
         key=key,
         group=group,
         metric=metric,
         form="distance",
-        candidate=_distance_estimate(to_candidate, draws_candidate, n_blocks),
-        replicate=_distance_estimate(to_replicate, draws_replicate, n_blocks),
+        candidate=distance_estimate(to_candidate, draws_candidate, n_blocks),
+        replicate=distance_estimate(to_replicate, draws_replicate, n_blocks),
         ratio=ratio,
         p_value=p if math.isfinite(to_candidate) else math.nan,
         p_replicate=p_replicate,
         tolerance=2.0,
         tolerance_text="≤ 2 × replicate",
-        statement=words if math.isfinite(ratio.value) else f"{metric}: not as in the reference",
+        statement=f"{lower_first(metric)}: {words}",
         divergence=(to_candidate**2, to_replicate**2) if n_series == 1 else None,
     )
 
@@ -304,12 +320,6 @@ def distance_row(
 def series_counts(inputs: ComparisonInput, series: Three, bins: Bins) -> list[FloatArray]:
     """Return histograms per block `(n_blocks, n_bins)` of one series `(n,)` per segment and sample."""
     return [distributions.block_counts(v, bins, s.blocks) for s, v in zip(inputs.samples, series, strict=True)]
-
-
-def series_distance(inputs: ComparisonInput, series: Three, bins: Bins, key: str, name: str, group: Group) -> Row:
-    """Return the Jensen-Shannon distance row of one series `(n,)` per segment and sample."""
-    what = f"the distribution of {lower_first(name)} is"
-    return distance_row(inputs, series_counts(inputs, series, bins), key, group, f"{name}, distance", what)
 
 
 def mean_distance(
@@ -321,10 +331,8 @@ def mean_distance(
     group: Group,
     groups: Groups | None = None,
 ) -> Row:
-    """Return the row of the mean Jensen-Shannon distance over the columns `(n, k)`, one `Bins` each.
-
-    With `groups` of equal columns, one histogram and one `Bins` a group.
-    """
+    """Return the row of the mean Jensen-Shannon distance over the columns `(n, k)`, one `Bins` each; with `groups` of
+    equal columns, one histogram and one `Bins` a group."""
     chosen = [[k] for k in range(len(bins))] if groups is None else [g.tolist() for g in groups]
 
     def counts(sample: Sample, values: Segments) -> FloatArray:
@@ -334,56 +342,23 @@ def mean_distance(
 
     three = [counts(s, v) for s, v in zip(inputs.samples, segments, strict=True)]
     metric = f"{name}, distance" if len(bins) == 1 else f"{name}, mean distance of {len(bins)}"
-    return distance_row(inputs, three, key, group, metric, f"{lower_first(name)}: distributions")
+    return distance_row(inputs, three, key, group, metric)
+
+
+def densities(
+    counts: Sequence[npt.NDArray[Any]], bins: Bins, label: str, unit: str, section: Section = "distributions"
+) -> Histogram:
+    """Return the densities of counts `(bins.n_total,)` of (reference, candidate, replicate), normalised over all
+    frames, in range or not."""
+    width = (bins.high - bins.low) / bins.n
+    ref, cand, rep = (c[: bins.n] / max(c.sum(), 1) / width for c in counts)
+    outside = [float(c[bins.n :].sum() / max(c.sum(), 1)) for c in counts]
+    return Histogram(label, unit, bins.edges, ref, cand, rep, (outside[0], outside[1], outside[2]), section)
 
 
 def histogram(inputs: ComparisonInput, series: Three, bins: Bins, label: str, unit: str) -> Histogram:
-    """Return the densities of (reference, candidate, replicate), normalised over all frames, in range or not."""
-    width = (bins.high - bins.low) / bins.n
-    counts = [c.sum(0) for c in series_counts(inputs, series, bins)]
-    ref, cand, rep = (c[: bins.n] / c.sum() / width for c in counts)
-    outside = [float(c[bins.n :].sum() / c.sum()) for c in counts]
-    return Histogram(label, unit, bins.edges, ref, cand, rep, (outside[0], outside[1], outside[2]))
-
-
-_Distance = Callable[[FloatArray, FloatArray], FloatArray]
-
-
-def _drawn_distances(
-    inputs: ComparisonInput, equal: Sequence[FloatArray], distance: _Distance
-) -> tuple[FloatArray, FloatArray]:
-    """Return bootstrap draws `(n_draws,)` of the distances of candidate and replicate to the reference.
-
-    `equal`: sums over the equally long parts of (reference, candidate, replicate), `(n_blocks, n_sums)`.
-    """
-    found: tuple[list[FloatArray], list[FloatArray]] = ([], [])
-    batch = max(1, int(_DRAWN_VALUES // max(equal[0].shape[1], 1)))
-    for start in range(0, inputs.options.n_bootstrap, batch):
-        ref, cand, rep = (
-            s.equal_weights[start : start + batch] @ c for s, c in zip(inputs.samples, equal, strict=True)
-        )
-        found[0].append(distance(ref, cand))
-        found[1].append(distance(ref, rep))
-    return np.concatenate(found[0]), np.concatenate(found[1])
-
-
-def _permutation_pair(
-    inputs: ComparisonInput, flat: Sequence[FloatArray], distance: _Distance, strata: Sequence[IntArray] | None
-) -> tuple[float, float]:
-    """Return the p-values of the candidate and of the replicate by block permutation; see `distance_row`.
-
-    `flat`: sums over all blocks of (reference, candidate, replicate), `(n_blocks, n_sums)`.
-    """
-    rng = np.random.default_rng([inputs.options.seed, 99])
-    kinds = [np.zeros(len(c), dtype=np.int64) for c in flat] if strata is None else strata
-
-    def p(sources: list[int], other: int) -> float:
-        counts = np.concatenate([flat[k] for k in sources])
-        of_block = np.concatenate([kinds[k] for k in (*sources, other)])
-        return permutation_p(counts, flat[other], distance, rng, inputs.options.n_permutations, of_block)
-
-    of_replicate = p([0], 2)
-    return p([0] if of_replicate < UNLIKE_BELOW else [0, 2], 1), of_replicate
+    """Return the densities of one series `(n,)` per segment and sample."""
+    return densities([c.sum(0) for c in series_counts(inputs, series, bins)], bins, label, unit)
 
 
 def reference_of(reference: Estimate, replicate: Estimate, *, log: bool = False) -> Estimate:
@@ -394,7 +369,7 @@ def reference_of(reference: Estimate, replicate: Estimate, *, log: bool = False)
     return pooled(reference, replicate, log=log)
 
 
-def _distance_estimate(value: float, draws: FloatArray, n_blocks: int) -> Estimate:
+def distance_estimate(value: float, draws: FloatArray, n_blocks: int) -> Estimate:
     """Intervals are made for the squared distance (a divergence adds up its noise) and then rooted, at least 0."""
     squared = estimate(value**2, draws**2, n_blocks)
     low, high = (math.sqrt(max(x, 0.0)) if math.isfinite(x) else math.nan for x in (squared.low, squared.high))
@@ -407,13 +382,9 @@ def observable_row(
     metric: Quantity,
     values: Sequence[float],
     draws: Sequence[FloatArray],
-    statement: Callable[[float, float], str],
 ) -> Row:
-    """Return the row of a number that each trajectory has by itself.
-
-    `values` and bootstrap `draws` `(n_draws,)` are of (reference, candidate, replicate), in the metric's unit.
-    `statement(candidate, reference)` words the deviation.
-    """
+    """Return the row of a number that each trajectory has by itself: `values` and bootstrap `draws` `(n_draws,)` of
+    (reference, candidate, replicate), in the metric's unit."""
     log = metric.relative
     made = [estimate(v, d, s.blocks.n_blocks, log=log) for v, d, s in zip(values, draws, inputs.samples, strict=True)]
     if metric.unit == "%":
@@ -439,7 +410,7 @@ def observable_row(
         p_replicate=1.0 if near_replicate else difference_p(rep, ref, log=log),
         tolerance=metric.tolerance * ref.value if log else metric.tolerance,
         tolerance_text=metric.tolerance_text or f"± {metric.tolerance_words()}",
-        statement=statement(cand.value, ref.value) if math.isfinite(cand.value) else f"{metric.name}: it does not move",
+        statement=metric.deviation(cand.value, ref.value),
     )
 
 
@@ -469,10 +440,8 @@ Limits = tuple[FloatArray, FloatArray]
 
 
 def bounds(segments: Segments) -> Limits:
-    """Return the least and greatest finite value of every column `(k,)`, each a whole range further out.
-
-    Values beyond count as these: an exploded frame is the validity checks' to report, and must not drown the others.
-    """
+    """Return the least and greatest finite value of every column `(k,)`, each a whole range further out. Values beyond
+    count as these: an exploded frame is the validity checks' to report, and must not drown the others."""
     with np.errstate(invalid="ignore"):
         finite = [np.where(np.isfinite(s), s, np.nan) for s in segments]
         low = np.min([np.nanmin(s, axis=0, initial=np.inf) for s in finite], axis=0)
@@ -505,27 +474,14 @@ def three_means(inputs: ComparisonInput, series: Three, *, limited: bool = False
     return [block_means(s, v, limits) for s, v in zip(inputs.samples, series, strict=True)]
 
 
-def mean_row(
-    inputs: ComparisonInput, metric: Quantity, means: Sequence[Means], k: int, statement: Callable[[float, float], str]
-) -> Row:
-    """Return the row of the mean of column `k`, from `means` of (reference, candidate, replicate); see
-    `observable_row`."""
-    values, draws = [float(m.values[k]) for m in means], [m.draws[:, k] for m in means]
-    return observable_row(inputs, metric, values, draws, statement)
+def mean_row(inputs: ComparisonInput, metric: Quantity, means: Sequence[Means], k: int = 0) -> Row:
+    """Return the row of the mean of column `k`, from `means` of (reference, candidate, replicate)."""
+    return observable_row(inputs, metric, [float(m.values[k]) for m in means], [m.draws[:, k] for m in means])
 
 
-def shift_row(
-    inputs: ComparisonInput,
-    metric: Quantity,
-    means: Sequence[Means],
-    labels: Sequence[str],
-    statement: Callable[[str, float, float], str],
-) -> Row:
-    """Return the row of the column whose mean is furthest off, from `means` of (reference, candidate, replicate).
-
-    `labels` name the columns, and the worst one's is in the row's name. The p-value is the least over all columns
-    times their number (Bonferroni). `statement(label, candidate, reference)` words the deviation.
-    """
+def shift_row(metric: Quantity, means: Sequence[Means], labels: Sequence[str]) -> Row:
+    """Return the row of the column whose mean is furthest off, from `means` of (reference, candidate, replicate);
+    `labels` name the columns. The p-value is the least over all columns times their number (Bonferroni)."""
     ref, cand, rep = means
     shift, replicate_baseline = np.abs(cand.values - ref.values), np.abs(rep.values - ref.values)
     worst = int(np.nanargmax(shift)) if np.isfinite(shift).any() else 0
@@ -551,5 +507,5 @@ def shift_row(
         p_replicate=least[1],
         tolerance=metric.tolerance,
         tolerance_text=metric.tolerance_text or f"≤ {metric.tolerance_words()}",
-        statement=statement(labels[worst], float(cand.values[worst]), float(ref.values[worst])),
+        statement=metric.deviation(float(cand.values[worst]), float(ref.values[worst]), labels[worst]),
     )

@@ -9,15 +9,16 @@ with its error.
 
 from __future__ import annotations
 
+import itertools
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 
 from surrogate.comparison.measure import distributions, kinetics
-from surrogate.comparison.measure.distributions import RAMACHANDRAN_BINS, TORSION_BINS
+from surrogate.comparison.measure.distributions import RAMACHANDRAN_BINS, TORSION_BINS, Bins
 from surrogate.comparison.measure.slow_motion import slow_torsions, tica_features
 from surrogate.comparison.measure.statistics import (
     BLOCK_IN_CORRELATION_TIMES,
@@ -39,7 +40,6 @@ from surrogate.comparison.rows.rows import (
     Measured,
     Quantity,
     Row,
-    Sample,
     Skipped,
     Three,
     distance_row,
@@ -50,7 +50,6 @@ from surrogate.comparison.rows.rows import (
     mean_row,
     observable_row,
     series_counts,
-    series_distance,
     shift_row,
     three_means,
 )
@@ -65,6 +64,10 @@ MOST_MAPS = 16
 _MOST_DRAWN = 24
 _LARGEST = Quantity(
     "population_shift", "populations", "Largest shift of a basin's population", "%", 5.0, resolution=0.1
+)
+_STEP_CAUSES = (
+    "; possible causes: another time between frames than said, another temperature, friction, force field or solvent, "
+    "smoothed frames, or a model that moves too far or too little in a step"
 )
 # Fewer visits than this in all MD of a comparison, and a smaller share of its frames, make a state rare.
 _FEW_VISITS, _SMALL_SHARE = 10, 0.1
@@ -81,7 +84,6 @@ _NAMES: dict[TorsionKind, str] = {
     "rotatable": "Rotatable torsions",
     "rotor": "Rotors (methyl, hydroxyl, ammonium)",
 }
-_WITHOUT_CHANGED, _LEAST_UNCHANGED = "Distributions without frames that guards changed", 0.1
 # A state that holds less of the frames of any of the three is left out of what moves within states.
 _LEAST_SHARE = 0.05
 _MOST_TORSIONS = 8
@@ -103,11 +105,8 @@ def population_rows(inputs: ComparisonInput) -> Measured:
     found = [("ψ in the β basin", x) for x in inputs.torsions.psi_labels]
     found += [("φ > 0", x) for x in inputs.torsions.phi_labels]
     n_psi = len(inputs.torsions.psi_labels)
-    skipped: list[Skipped] = []
     if not found:
-        skipped.append(("Torsion distributions, basins, autocorrelation", "the scene has no φ or ψ torsion"))
-    elif not inputs.torsions.residues:
-        skipped.append(("Joint φ/ψ maps", "no residue has both torsions"))
+        return left_out("Torsion distributions, basins, autocorrelation", "the scene has no φ or ψ torsion")
 
     def members(f: Features) -> list[AnyFloat]:
         angles = zip(f.phi, f.psi, strict=True)
@@ -116,7 +115,7 @@ def population_rows(inputs: ComparisonInput) -> Measured:
 
     means = three_means(inputs, [members(s.features) for s in inputs.samples])
     if _are_many(inputs):
-        return Measured([shift_row(inputs, _LARGEST, means, [", ".join(x) for x in found], _instead)])
+        return Measured([shift_row(_LARGEST, means, [", ".join(x) for x in found])])
     rows, rare = [], rare_residues(inputs)
     for k, (name, label) in enumerate(found):
         if k - n_psi in rare:
@@ -124,44 +123,60 @@ def population_rows(inputs: ComparisonInput) -> Measured:
             continue
         share = float(means[0].values[k])
         tolerance = min(share, 100.0 - share) * ONE_KJ_SHARE
-        quantity = Quantity(
-            f"population:{name}:{label}", "populations", f"{name}, {label}", "%", tolerance, "± 1 kJ/mol"
-        )
-        rows.append(mean_row(inputs, quantity, means, k, _held(f"{name} of {label}")))
-    return Measured(rows, skipped=skipped)
-
-
-def _instead(label: str, candidate: float, reference: float) -> str:
-    return f"{label}: {candidate:.3g} % of frames instead of {reference:.3g} %"
-
-
-def _held(what: str) -> Callable[[float, float], str]:
-    def statement(candidate: float, reference: float) -> str:
-        if candidate == 0.0:
-            return f"{what} is never visited (reference {reference:.3g} %)"
-        return f"{what} holds {candidate:.3g} % instead of {reference:.3g} %"
-
-    return statement
+        key, said = f"population:{name}:{label}", f"{name}, {label}"
+        rows.append(mean_row(inputs, Quantity(key, "populations", said, "%", tolerance, "± 1 kJ/mol"), means, k))
+    return Measured(rows)
 
 
 def torsion_rows(inputs: ComparisonInput) -> Measured:
     """Return Jensen-Shannon distances: jointly per residue (50 x 50 bins), then phi and psi alone (100 bins); of many
     residues their means. Where phi > 0 is rare it is left out of the map and of phi. Maps and histograms are drawn of
     all, of many residues of some."""
-    rows = _mean_torsion_rows(inputs) if _are_many(inputs) else _single_torsion_rows(inputs)
-    of_map = {row.key: row for row in rows}
-    charts: list[Chart] = [
-        _map(inputs, residue, of_map.get(f"joint_jsd:{residue.label}"))
-        for residue in evenly(inputs.torsions.residues, _MOST_DRAWN)
-    ]
-    for symbol, key, labels in _phi_psi(inputs):
+    many = _are_many(inputs)
+    rows: list[Row] = []
+    for key, group in itertools.groupby(_histograms(inputs, many), lambda found: found.key):
+        for part in [list(group)] if many else ([one] for one in group):
+            label = f"mean of {len(part)} residues" if many else part[0].label
+            counts = [np.stack(of_sample, axis=1) for of_sample in zip(*(x.counts for x in part), strict=True)]
+            metric = f"{part[0].name} distance, {label}"
+            rows.append(distance_row(inputs, counts, f"{key}:{label}", "distributions", metric))
+    charts: list[Chart] = [_map(inputs, residue) for residue in evenly(inputs.torsions.residues, _MOST_DRAWN)]
+    for symbol, name, labels in _phi_psi(inputs):
         for k, label in evenly(list(enumerate(labels)), _MOST_DRAWN):
-            charts.append(histogram(inputs, inputs.column(key, k), TORSION_BINS, f"{symbol} {label}", "rad"))
+            charts.append(histogram(inputs, inputs.column(name, k), TORSION_BINS, f"{symbol} {label}", "rad"))
     return Measured(rows, charts)
 
 
 def _phi_psi(inputs: ComparisonInput) -> list[tuple[str, Literal["phi", "psi"], tuple[str, ...]]]:
     return [("φ", "phi", inputs.torsions.phi_labels), ("ψ", "psi", inputs.torsions.psi_labels)]
+
+
+class _Histogram(NamedTuple):
+    """A φ/ψ map or one torsion of a residue: `counts` per block of (reference, candidate, replicate)."""
+
+    key: str
+    name: str
+    label: str
+    counts: list[FloatArray]
+
+    def at_negative_phi(self, bins: Bins) -> _Histogram:
+        """Return the same without phi > 0."""
+        counts = [without_positive_phi(c, bins.n) for c in self.counts]
+        return self._replace(name=f"{self.name} at φ < 0", counts=counts)
+
+
+def _histograms(inputs: ComparisonInput, many: bool) -> Iterator[_Histogram]:
+    """Yield the map and the single torsions of every residue, of `many` of some; without phi > 0 where that is rare."""
+    residues, rare = inputs.torsions.residues, frozenset[int]() if many else rare_residues(inputs)
+    for residue in evenly(residues, MOST_MAPS) if many else residues:
+        counts = [joint_counts(s.features, s.blocks, residue) for s in inputs.samples]
+        found = _Histogram("joint_jsd", "Joint φ/ψ", residue.label, counts)
+        yield found.at_negative_phi(RAMACHANDRAN_BINS) if residue.phi in rare else found
+    for symbol, angle, labels in _phi_psi(inputs):
+        for k, label in evenly(list(enumerate(labels)), MOST_HISTOGRAMS if many else len(labels)):
+            counts = series_counts(inputs, inputs.column(angle, k), TORSION_BINS)
+            found = _Histogram(f"{angle}_jsd", symbol, label, counts)
+            yield found.at_negative_phi(TORSION_BINS) if angle == "phi" and k in rare else found
 
 
 def joint_counts(f: Features, blocks: Blocks, residue: Residue) -> FloatArray:
@@ -170,58 +185,12 @@ def joint_counts(f: Features, blocks: Blocks, residue: Residue) -> FloatArray:
     return distributions.block_counts_joint(phi, psi, RAMACHANDRAN_BINS, blocks)
 
 
-def _map(inputs: ComparisonInput, residue: Residue, row: Row | None) -> Landscape:
-    """Counts over φ and ψ; captions with the distances of the residue's row, where it has one."""
+def _map(inputs: ComparisonInput, residue: Residue) -> Landscape:
     n, n_total = RAMACHANDRAN_BINS.n, RAMACHANDRAN_BINS.n_total
     counts = [joint_counts(s.features, s.blocks, residue).sum(0) for s in inputs.samples]
     ref, cand, rep = (c.reshape(n_total, n_total)[:n, :n] for c in counts)
     edges = np.degrees(RAMACHANDRAN_BINS.edges)
-    captions = ("Reference", "Candidate", "Replicate")
-    if row is not None and row.replicate is not None:
-        captions = (
-            "Reference",
-            f"Candidate: distance {row.candidate.value:.3g} to the reference",
-            f"Replicate: distance {row.replicate.value:.3g}, the replicate baseline",
-        )
-    title = f"φ and ψ of {residue.label}"
-    return Landscape("distributions", title, "φ / °", "ψ / °", edges, edges, ref, cand, rep, captions)
-
-
-def _single_torsion_rows(inputs: ComparisonInput) -> list[Row]:
-    rows, rare = [], rare_residues(inputs)
-    for residue in inputs.torsions.residues:
-        counts = [joint_counts(s.features, s.blocks, residue) for s in inputs.samples]
-        what = "Joint φ/ψ"
-        if residue.phi in rare:
-            counts, what = [without_positive_phi(c, RAMACHANDRAN_BINS.n) for c in counts], f"{what} at φ < 0"
-        rows.append(_jsd_row(inputs, counts, "joint_jsd", what, residue.label))
-    for symbol, key, labels in _phi_psi(inputs):
-        for k, label in enumerate(labels):
-            counts, what = series_counts(inputs, inputs.column(key, k), TORSION_BINS), symbol
-            if key == "phi" and k in rare:
-                counts, what = [without_positive_phi(c, TORSION_BINS.n) for c in counts], f"{symbol} at φ < 0"
-            rows.append(_jsd_row(inputs, counts, f"{key}_jsd", what, label))
-    return rows
-
-
-def _mean_torsion_rows(inputs: ComparisonInput) -> list[Row]:
-    rows = []
-    residues = evenly(inputs.torsions.residues, MOST_MAPS)
-    if residues:
-        counts = [np.stack([joint_counts(s.features, s.blocks, r) for r in residues], axis=1) for s in inputs.samples]
-        rows.append(_jsd_row(inputs, counts, "joint_jsd", "Joint φ/ψ", f"mean of {len(residues)} residues"))
-    for symbol, key, labels in _phi_psi(inputs):
-        columns = evenly(range(len(labels)), MOST_HISTOGRAMS)
-        if columns:
-            each = [series_counts(inputs, inputs.column(key, k), TORSION_BINS) for k in columns]
-            counts = [np.stack(of_sample, axis=1) for of_sample in zip(*each, strict=True)]
-            rows.append(_jsd_row(inputs, counts, f"{key}_jsd", symbol, f"mean of {len(columns)} residues"))
-    return rows
-
-
-def _jsd_row(inputs: ComparisonInput, counts: Sequence[FloatArray], key: str, what: str, label: str) -> Row:
-    words = f"the {what} distribution of {label} is"
-    return distance_row(inputs, counts, f"{key}:{label}", "distributions", f"{what} distance, {label}", words)
+    return Landscape("distributions", f"φ and ψ of {residue.label}", "φ / °", "ψ / °", edges, edges, ref, cand, rep)
 
 
 @dataclass(frozen=True)
@@ -267,12 +236,10 @@ def rare_residues(inputs: ComparisonInput) -> frozenset[int]:
 
 
 def free_energy_row(inputs: ComparisonInput, k: int, label: str) -> Row:
-    """Return the row of the free energy of phi > 0 over phi < 0, in kT, by the time inside.
-
-    Visits are independent and their lengths exponential, so that of n visits the logarithm has the error sqrt(2 / n);
-    of none the free energy is that of half a visit. The p-value is of the free energies, or of the visits if that is
-    less (exact: which trajectory a visit falls into is a matter of their lengths), in either case doubled.
-    """
+    """Return the row of the free energy of phi > 0 over phi < 0, in kT, by the time inside. Visits are independent and
+    their lengths exponential: of n visits the logarithm has the error sqrt(2 / n); of none the free energy is that of
+    half a visit. The p-value is of the free energies, or of the visits if that is less (exact: which trajectory a visit
+    falls into is a matter of their lengths), in either case doubled."""
     found = list(map(visits_of, inputs.column("phi", k)))
     reference, candidate, replicate = found
     of_all = reference + candidate + replicate
@@ -282,15 +249,10 @@ def free_energy_row(inputs: ComparisonInput, k: int, label: str) -> Row:
     errors = [math.sqrt(2.0 / max(v.visits, 0.5)) for v in found]
     normal = np.random.default_rng([inputs.options.seed, k]).normal(size=(3, _DRAWS))
     n = candidate.visits
-    seen = f"visited {n} {'time' if n == 1 else 'times'}" if n else "never visited"
-
-    def statement(own: float, theirs: float) -> str:
-        return f"φ > 0 of {label} is {seen}, {own:.2g} kT above φ < 0 instead of {theirs:.2g} kT"
-
+    seen = f" ({f'visited {n} times' if n else 'never visited'})"
     key, name = f"free_energy:φ > 0:{label}", f"Free energy of φ > 0, {label}"
-    metric = Quantity(key, "populations", name, "kT", _TOLERANCE_KT, "± 1 kJ/mol")
-    draws = [v + e * n for v, e, n in zip(values, errors, normal, strict=True)]
-    row = observable_row(inputs, metric, values, draws, statement)
+    metric = Quantity(key, "populations", name, "kT", _TOLERANCE_KT, "± 1 kJ/mol", hint=seen)
+    row = observable_row(inputs, metric, values, [v + e * x for v, e, x in zip(values, errors, normal, strict=True)])
     return replace(
         row,
         ratio=None,
@@ -322,13 +284,9 @@ def without_positive_phi(counts: FloatArray, n_bins: int) -> FloatArray:
 
 
 def other_torsion_rows(inputs: ComparisonInput) -> Measured:
-    """Return Jensen-Shannon distances of every torsion beside phi and psi, 100 bins, symmetric rotors folded.
-
-    Chi and rotatable bonds have a row each (one for all above six), omega and rotors one for all of them.
-    """
-    probes = inputs.reference.features.probes
-    if probes is None:
-        return Measured()
+    """Return Jensen-Shannon distances of every torsion beside phi and psi, 100 bins, symmetric rotors folded: chi and
+    rotatable bonds have a row each (one for all above six), omega and rotors one for all of them."""
+    probes = inputs.probes
     rows: list[Row] = []
     charts: list[Chart] = []
     skipped: list[Skipped] = []
@@ -338,12 +296,11 @@ def other_torsion_rows(inputs: ComparisonInput) -> Measured:
             skipped.append((name, "the scene has none"))
         elif kind in ("χ", "rotatable") and len(chosen) <= _MANY:
             for k in chosen:
-                series = inputs.column("torsions", k)
                 label, fold = probes.torsions[k].label, probes.torsions[k].fold
                 label += "" if fold == 1 else f" ({fold} equal positions folded: {fold} times the angle)"
-                key = f"torsion_jsd:{label}"
-                rows.append(series_distance(inputs, series, TORSION_BINS, key, label, "distributions"))
-                charts.append(histogram(inputs, series, TORSION_BINS, label, "rad"))
+                series, key = inputs.families("torsions", k), f"torsion_jsd:{label}"
+                rows.append(mean_distance(inputs, series, [TORSION_BINS], key, label, "distributions"))
+                charts.append(histogram(inputs, inputs.column("torsions", k), TORSION_BINS, label, "rad"))
         else:
             few = evenly(chosen, _MAX_SERIES)
             if len(few) < len(chosen):
@@ -353,50 +310,9 @@ def other_torsion_rows(inputs: ComparisonInput) -> Measured:
     return Measured(rows, charts, skipped)
 
 
-def intervention_rows(inputs: ComparisonInput) -> Measured:
-    """Return each joint φ/ψ distance with the changed frames of the candidate left out, beside that of all frames.
-
-    Where the two differ, the interventions show in the statistics. Skipped where no frame was changed, or nearly all
-    were; a candidate whose file has no such column gets neither rows nor a reason.
-    """
-    changed = inputs.candidate.features.changed
-    if changed is None:
-        return Measured()
-    share = float(np.concatenate(list(changed)).mean())
-    if share == 0.0:
-        return left_out(_WITHOUT_CHANGED, "the guards changed no frame")
-    if share > 1.0 - _LEAST_UNCHANGED:
-        return left_out(_WITHOUT_CHANGED, f"{100 * share:.3g} % of the frames were changed")
-    rows = []
-    for residue in inputs.torsions.residues:
-        where = f"{residue.label}, without the {100 * share:.2g} % that guards changed"
-        key, metric = f"joint_jsd_unchanged:{residue.label}", f"Joint φ/ψ distance, {where}"
-        counts = [_unchanged_counts(s, residue) for s in inputs.samples]
-        rows.append(distance_row(inputs, counts, key, "distributions", metric, f"the φ/ψ distribution of {where}, is"))
-    return Measured(rows)
-
-
-def _unchanged_counts(sample: Sample, residue: Residue) -> FloatArray:
-    """Joint histograms per block `(n_blocks, n_bins)` of the frames that nothing was done about."""
-    f, n = sample.features, RAMACHANDRAN_BINS.n_total
-    counts = joint_counts(f, sample.blocks, residue)
-    if f.changed is None:
-        return counts
-    for piece in sample.blocks.pieces:
-        part = slice(piece.start, piece.stop)
-        gone = f.changed[piece.segment][part]
-        phi, psi = f.phi[piece.segment][part, residue.phi][gone], f.psi[piece.segment][part, residue.psi][gone]
-        index = RAMACHANDRAN_BINS.index(phi) * n + RAMACHANDRAN_BINS.index(psi)
-        counts[piece.block] -= np.bincount(index, minlength=n * n)
-    return counts
-
-
 def within_rows(inputs: ComparisonInput) -> Measured:
     """Return rows of phi given psi's basin of every residue (of other molecules: of every rotatable torsion given the
-    slowest motion).
-
-    Within a state, what is left is remembered for a short while: blocks are many, and so is what they can tell.
-    """
+    slowest motion). Within a state little is remembered for long: blocks are many, and so is what they can tell."""
     if _are_many(inputs):
         return left_out("φ given ψ's basin", f"{len(inputs.torsions.residues)} residues share their rows")
     rows: list[Row | None] = []
@@ -404,15 +320,13 @@ def within_rows(inputs: ComparisonInput) -> Measured:
     if inputs.torsions.residues:
         for residue in inputs.torsions.residues:
             metric = f"φ given ψ's basin, distance, {residue.label}"
-            what = f"φ of {residue.label} within the basins of ψ is distributed"
             phi, states = inputs.column("phi", residue.phi), _basins(inputs, residue)
-            rows.append(_conditional_row(inputs, [phi], states, f"phi_given_psi:{residue.label}", metric, what))
+            rows.append(_conditional_row(inputs, [phi], states, f"phi_given_psi:{residue.label}", metric))
     elif len(turning) > 1:
         chosen = turning[:_MOST_TORSIONS]
         metric = f"{len(chosen)} rotatable torsions given the slowest motion, mean distance"
-        what = "rotatable torsions within states of the slowest motion are distributed"
         angles = [inputs.column("torsions", k) for k in chosen]
-        rows.append(_conditional_row(inputs, angles, slow_states(inputs), "torsions_given_slowest", metric, what))
+        rows.append(_conditional_row(inputs, angles, slow_states(inputs), "torsions_given_slowest", metric))
     skipped = [("Torsions within the states of slower ones", "the three trajectories share none of them")]
     return Measured([row for row in rows if row is not None], skipped=skipped if None in rows else [])
 
@@ -429,7 +343,7 @@ def _basins(inputs: ComparisonInput, residue: Residue) -> States:
 
 
 def _conditional_row(
-    inputs: ComparisonInput, angles: Sequence[Three], states: States, key: str, metric: str, what: str
+    inputs: ComparisonInput, angles: Sequence[Three], states: States, key: str, metric: str
 ) -> Row | None:
     """Return the row of angles within states. None where no state holds one frame in twenty of each of the three, of
     all of it and of the equal length."""
@@ -456,15 +370,13 @@ def _conditional_row(
         most = int(max(int(s.max(initial=0)) for s in states[which])) + 2
         of_block = distributions.count_in_blocks([s + 1 for s in states[which]], most, sample.blocks)
         strata.append(np.asarray(of_block.argmax(axis=1), dtype=np.int64))
-    return distance_row(chosen, counts, key, "distributions", metric, what, strata)
+    return distance_row(chosen, counts, key, "distributions", metric, strata)
 
 
 def step_rows(inputs: ComparisonInput) -> Measured:
-    """Return the row of the step of all torsions from frame to frame: its root mean square, as if every trajectory were
-    in the states of the slowest motion as often as the reference. A wrong time between frames shows here first.
-
-    Only states that all three hold count: what one run alone has met, and steps in otherwise, is no wrong time.
-    """
+    """Return the row of the root mean square step of all torsions from frame to frame, as if every trajectory were in
+    the states of the slowest motion as often as the reference; a wrong time between frames shows here first. Only
+    states that all three hold count: what one run alone has met, and steps in otherwise, is no wrong time."""
     if not (len(inputs.torsions.phi) or len(inputs.torsions.psi) or slow_torsions(inputs.reference.features)):
         return left_out("Steps of torsions from frame to frame", "the scene has no torsion to turn about")
     squared = [[_squared_steps(x) for x in _angles(s.features)] for s in inputs.samples]
@@ -491,8 +403,8 @@ def step_rows(inputs: ComparisonInput) -> Measured:
         values.append(float(_standardised(total.sum(0), count.sum(0), share)))
         draws.append(_standardised(sample.weights @ total, sample.weights @ count, share))
     name = f"Step of all torsions from frame to frame ({format_time_ps(inputs.lag_ps)}), root mean square"
-    metric = Quantity("torsion_step", "kinetics", name, "°", 0.05, relative=True)
-    return Measured([observable_row(fine, metric, values, draws, _step_words)])
+    metric = Quantity("torsion_step", "kinetics", name, "°", 0.05, relative=True, hint=_STEP_CAUSES)
+    return Measured([observable_row(fine, metric, values, draws)])
 
 
 def _angles(features: Features) -> list[AnyFloat]:
@@ -513,22 +425,6 @@ def _squared_steps(angles_rad: AnyFloat) -> FloatArray:
     return np.append(squared_turn(angles_rad), np.nan)[: len(angles_rad)]
 
 
-def _step_words(c: float, r: float) -> str:
-    """Return what the steps are, and what may be the cause; the row cannot tell these apart."""
-    words = f"torsions step by {c:.3g}° from frame to frame instead of {r:.3g}°"
-    if not math.isfinite(c) or c == r:
-        return words
-    if c > r:
-        return (
-            f"{words}; possible causes: frames further apart in time than said, a higher temperature, less friction, "
-            "another force field or solvent, or a model that moves too far in a step"
-        )
-    return (
-        f"{words}; possible causes: frames closer in time than said, a lower temperature, more friction, another force "
-        "field or solvent, smoothed frames, or a model that moves too little in a step"
-    )
-
-
 def _standardised(total: FloatArray, count: FloatArray, share: FloatArray) -> FloatArray:
     """Return the root in degrees of the means over states `(..., n_states)`, weighted by the reference's
     populations."""
@@ -539,11 +435,9 @@ def _standardised(total: FloatArray, count: FloatArray, share: FloatArray) -> Fl
 
 
 def with_own_blocks(inputs: ComparisonInput, series: Three) -> ComparisonInput:
-    """Return the comparison in blocks that are long enough for `series`, the slowest motion's at most.
-
-    The least length of ten correlation times of the series, doubled until no longer one gives means that vary more than
-    its own say (Flyvbjerg and Petersen, J. Chem. Phys. 91, 461, 1989): a weak slow part makes the blocks long again.
-    """
+    """Return the comparison in blocks that are long enough for `series`, the slowest motion's at most: ten correlation
+    times, doubled until no longer one gives means that vary more than its own say (Flyvbjerg and Petersen, J. Chem.
+    Phys. 91, 461, 1989), since a weak slow part makes the blocks long again."""
     longest = inputs.reference.blocks.n_frames_each
     n = min(s.features.n_frames for s in inputs.samples)
     times = [kinetics.zero_crossing([x - np.nanmean(np.concatenate(s)) for x in s])[1] for s in series]
@@ -606,12 +500,12 @@ def _in_quarters(
 ) -> States:
     """Fit TICA to `fitted`, and put every frame of `features` between the `edges` of its values there."""
     lag = max(1, round(_TICA_LAG_PS / inputs.lag_ps))
-    model = kinetics.fit_tica(fitted, lag) if max(map(len, fitted)) > 10 * lag else None
+    model = kinetics.fit_projection(fitted, lag, 1) if max(map(len, fitted)) > 10 * lag else None
     if model is None:
         return [[np.zeros(n, dtype=np.int64) for n in s.features.segment_lengths] for s in inputs.samples]
-    values = np.concatenate([model.project(x) for x in fitted])
+    values = np.concatenate([model.project(x)[:, 0] for x in fitted])
     between = edges(values[np.isfinite(values)])
-    projected = [[model.project(x) for x in own] for own in features]
+    projected = [[model.project(x)[:, 0] for x in own] for own in features]
     return [
         [np.where(np.isfinite(p), np.searchsorted(between, p), -1).astype(np.int64) for p in own] for own in projected
     ]

@@ -15,6 +15,7 @@ import pytest
 from surrogate.comparison.comparison import Comparison, Evaluation
 from surrogate.comparison.comparison import compare as compare_with_everything
 from surrogate.comparison.read.ensemble import Ensemble
+from surrogate.comparison.rows.charts import jsonable
 from surrogate.comparison.rows.rows import Options
 from systems.chemistry import validity
 from systems.chemistry.geometry import torsion
@@ -64,12 +65,12 @@ def test_shuffled_frames_lose_their_kinetics_and_nothing_else(inputs: Comparison
     np.random.default_rng(0).shuffle(frames)
     found = evaluate(inputs, frames)
     assert found.status == "different"
-    for key in ("correlation_time", "tic0_timescale", "torsion_step"):
+    for key in ("correlation_time", "msm_timescale", "torsion_step"):
         assert found.row(key).verdict in BAD, key
     for key in ("joint_jsd", "phi_jsd", "psi_jsd"):
         assert found.row(key).candidate.value == pytest.approx(fair.row(key).candidate.value, abs=1e-12)
         assert found.row(key).verdict == "agrees"
-    assert "too fast" in found.verdict
+    assert "relaxation time of cos ψ" in found.verdict
 
 
 def test_mirror_image_inverts_the_stereocentre(inputs: ComparisonInput) -> None:
@@ -101,7 +102,7 @@ def test_a_missing_basin_is_named(inputs: ComparisonInput, alanine_dipeptide: Sc
     assert found.row("population:φ > 0").candidate.value == 0.0
     assert found.row("population:φ > 0").verdict == "differs"
     assert found.row("phi_jsd").verdict == "differs"
-    assert any("φ > 0 of ALA 2 is never visited" in f for f in found.findings)
+    assert any("φ > 0, ALA 2: 0 % instead of" in f for f in found.findings)
 
 
 def test_three_percent_longer_bonds_are_named(
@@ -116,7 +117,7 @@ def test_three_percent_longer_bonds_are_named(
     frames[:, far] += 0.03 * (frames[:, nitrogen] - frames[:, carbon])[:, None]
     found = evaluate(inputs, frames)
     assert found.row("bond_shift").verdict == "differs"
-    assert re.search(r"C-N \(ACE 1 - ALA 2\) bonds are (2\.9|3\.0|3\.1) % long", found.verdict)
+    assert re.search(r"C-N \(ACE 1 - ALA 2\): 1\.\d+ Å instead of", found.verdict)
     assert "C-N (ACE 1 - ALA 2)" in found.row("bond_shift").metric
     assert found.row("bond_jsd").candidate.value > 1.3 * fair.row("bond_jsd").candidate.value
     assert words(found, "validity") == {"agrees"}, "3 % is within every per-frame rule: only the means can show it"
@@ -207,12 +208,12 @@ def test_two_atoms_swapped_are_noticed(inputs: ComparisonInput, pair: tuple[str,
 def test_a_wrong_time_axis_shows_in_the_relaxation_time(simulate: Callable[..., Ensemble], factor: float) -> None:
     longer = (simulate(71, 40_000), simulate(72, 40_000), simulate(73, 40_000))
     found = evaluate(longer, frames_of(longer), lag_ps=factor)
-    assert found.row("tic0_timescale").verdict == "differs"
+    assert found.row("msm_timescale").verdict == "differs"
     row = found.row("correlation_time")
     assert row.verdict == "differs"
     assert row.candidate.value == pytest.approx(factor * row.reference.value, rel=0.35)
     assert found.row("joint_jsd").verdict == "agrees"
-    assert ("too slowly" if factor > 1 else "too fast") in found.verdict
+    assert any("relaxation time of cos ψ, ALA 2" in f for f in found.findings)
 
 
 def test_five_picometres_of_noise_widen_the_bonds(inputs: ComparisonInput) -> None:
@@ -221,7 +222,7 @@ def test_five_picometres_of_noise_widen_the_bonds(inputs: ComparisonInput) -> No
     found = evaluate(inputs, frames)
     assert found.row("bond_width").verdict == "differs"
     assert found.row("bond_jsd").verdict == "differs"
-    assert any("vary by" in f for f in found.findings)
+    assert any("bond-length width" in f for f in found.findings)
 
 
 def test_seams_between_chunks_show(inputs: ComparisonInput, alanine_dipeptide: Scene) -> None:
@@ -238,7 +239,6 @@ def test_seams_between_chunks_show(inputs: ComparisonInput, alanine_dipeptide: S
     assert any("where one chunk meets the next" in f for f in found.findings)
     assert fine.row("chunk_step").verdict == "agrees"
     assert fine.row("chunk_step").candidate.low < 1.0 < fine.row("chunk_step").candidate.high
-    assert found.faults[1].n_chunks == n
 
 
 def test_a_shift_or_a_turn_of_the_whole_changes_nothing(inputs: ComparisonInput, fair: Evaluation) -> None:
@@ -254,5 +254,5 @@ def test_a_candidate_is_evaluated_the_same_alone_and_in_company(inputs: Comparis
     reference, candidate, replicate = inputs
     frozen = replace(candidate, label="frozen", segments=[np.repeat(candidate.segments[0][:1], 500, axis=0)])
     both = compare(reference, [frozen, candidate], replicate)
-    assert [r.to_dict() for r in both.evaluations[1].rows] == [r.to_dict() for r in fair.rows]
+    assert [jsonable(r) for r in both.evaluations[1].rows] == [jsonable(r) for r in fair.rows]
     assert both.evaluations[0].n_frames == 500

@@ -9,7 +9,7 @@ import pytest
 
 from surrogate.comparison.comparison import Evaluation, compare
 from surrogate.comparison.measure.statistics import Estimate
-from surrogate.comparison.metrics import METRICS, FunctionMetric
+from surrogate.comparison.metrics import METRICS, Metric
 from surrogate.comparison.read.ensemble import Ensemble
 from surrogate.comparison.rows.charts import Line, LineChart
 from surrogate.comparison.rows.rows import ComparisonInput, Kind, Measured, Options, Row, TimeScale
@@ -75,7 +75,7 @@ def test_a_third_party_s_metric_counts_by_its_kind_and_time_scale(
     seen: bool,
 ) -> None:
     """What gives information alone never counts; in a comparison of one independent sample only what is fast does."""
-    own = FunctionMetric("Made up", kind, time_scale, wrong_row)
+    own = Metric("Made up", kind, time_scale, wrong_row)
     monkeypatch.setattr("surrogate.comparison.comparison.METRICS", (*METRICS[:1], own))
     three = [ensembles[0], replace(ensembles[1], segments=[ensembles[1].segments[0][:n_frames]]), ensembles[2]]
     found = evaluated(three)

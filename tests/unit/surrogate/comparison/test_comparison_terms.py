@@ -101,7 +101,7 @@ def test_a_scene_without_torsions_is_evaluated_by_what_it_has() -> None:
     assert hot.row("bond_width").verdict == "differs"
     reasons = dict(good.skipped)
     assert reasons["Torsion distributions, basins, autocorrelation"] == "the scene has no φ or ψ torsion"
-    assert reasons["Stereocentres"] == "the scene has none"
+    assert reasons["Stereocentres"] == "none among the atoms compared"
     assert any(what.startswith("TICA") for what in reasons)
     assert not any(r.group in ("populations", "kinetics") for r in good.rows)
 

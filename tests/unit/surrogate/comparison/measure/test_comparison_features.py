@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from small_scenes import beyond, rotated
-from surrogate.comparison.measure.structure import find_probes, find_rings, mean_structure, pucker
+from surrogate.comparison.measure.structure import find_probes, mean_structure
 from surrogate.comparison.measure.torsions import find_torsions
 from surrogate.comparison.read.ensemble import Ensemble, load_ensemble
 from systems.prepare.peptide import build_peptide
@@ -182,37 +182,17 @@ def test_small_molecules_have_every_rotatable_torsion() -> None:
     assert kinds["neopentane"] == [("rotor", 3)] * 4
 
 
-def ring_frame(heights: np.ndarray, radius: float = 0.14) -> np.ndarray:
-    """A ring that runs clockwise as seen from +z: that is the side which Cremer and Pople call above."""
-    n = len(heights)
-    turn = 2 * np.pi * np.arange(n) / n
-    return np.stack([radius * np.cos(turn), -radius * np.sin(turn), heights])[:, :, None]
-
-
-@pytest.mark.parametrize("phase", [-2.5, -0.4, 0.0, 1.1, 3.0])
-def test_pucker_of_five_and_six_rings(phase: float) -> None:
-    """Heights made by Cremer and Pople's own inverse, eq. 13: amplitude and phase come back."""
-    five = np.sqrt(2 / 5) * 0.04 * np.cos(phase + 4 * np.pi * np.arange(5) / 5)
-    amplitude, angle = pucker(ring_frame(five), range(5))[:, 0]
-    assert amplitude == pytest.approx(0.04, rel=1e-6)
-    assert np.cos(angle - phase) == pytest.approx(1.0, abs=1e-9)
-    alternating = (-1.0) ** np.arange(6)
-    for theta, mix in ((0.0, (0.0, 1.0)), (np.pi, (0.0, -1.0)), (np.pi / 2, (1.0, 0.0)), (np.pi / 4, (0.5**0.5,) * 2)):
-        six = np.sqrt(1 / 3) * 0.06 * mix[0] * np.cos(phase + 4 * np.pi * np.arange(6) / 6)
-        six = six + 0.06 * mix[1] * alternating / np.sqrt(6)
-        amplitude, angle = pucker(ring_frame(six), range(6))[:, 0]
-        assert (amplitude, angle) == pytest.approx((0.06, theta), abs=1e-6)
-
-
-def test_rings_that_can_pucker(peptide: Scene) -> None:
-    rings = find_rings(peptide)
-    assert [sorted(peptide.atom_names[i] for i in r) for r in rings] == [["CA", "CB", "CD", "CG", "N"]], "not phenyl"
+def test_rings_that_can_pucker_have_a_torsion(peptide: Scene) -> None:
+    (ring,) = (t for t in find_torsions(peptide) if t.kind == "ring")
+    assert {peptide.atom_names[i] for i in ring.quad} < {"CA", "CB", "CD", "CG", "N"}, "proline's, not phenyl's"
+    assert ring.label.startswith("ring") and "PRO 4" in ring.label
     probes = find_probes(peptide, peptide.positions_nm[None].astype(np.float32))
-    assert probes.labels("puckers")[0].startswith("amplitude, ring") and "PRO 4" in probes.labels("puckers")[0]
     mirrored = peptide.positions_nm * [1.0, 1.0, -1.0]
-    both = [probes.measure(x[None].astype(np.float32))["puckers"][0] for x in (peptide.positions_nm, mirrored)]
-    assert both[0][0] == pytest.approx(both[1][0], abs=1e-6) and 0.02 < both[0][0] < 0.06
-    assert np.cos(both[0][1] - both[1][1]) == pytest.approx(-1.0, abs=1e-4), "the mirror image puckers the other way"
+    k = probes.torsions.index(ring)
+    one, other = (
+        probes.measure(x[None].astype(np.float32))["torsions"][0, k] for x in (peptide.positions_nm, mirrored)
+    )
+    assert abs(one) > 0.1 and other == pytest.approx(-one, abs=1e-4), "the mirror image puckers the other way"
 
 
 def test_a_frame_that_is_not_finite_measures_nothing(simulate: Callable[..., Ensemble]) -> None:

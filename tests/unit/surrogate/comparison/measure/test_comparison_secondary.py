@@ -1,9 +1,8 @@
 """Secondary structure: a helix that was built is one, an extended chain is none; real structures are read as MDTraj
-reads them, whatever their residues are called."""
+reads them."""
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +20,7 @@ ALPHA_DEG = {"phi": -60.0, "psi": -45.0}
 
 
 def read(scene: Scene, frames_nm: npt.NDArray[Any]) -> npt.NDArray[np.int8]:
-    return secondary_structure(frames_nm, find_chains(scene, {i: i for i in range(scene.n_atoms)}))
+    return secondary_structure(np.asarray(frames_nm), scene, find_chains(scene))
 
 
 def coiled(scene: Scene) -> npt.NDArray[np.float64]:
@@ -73,15 +72,12 @@ def test_a_candidate_that_unfolds_is_named_residue_by_residue(peptide: Scene) ->
     fair, wrong = compare(run(0.0), [run(0.0), run(0.5)], run(0.0), options=Options(peptide_recipe=False)).evaluations
     assert fair.row("secondary:helix").verdict == "agrees"
     assert wrong.row("secondary:helix").verdict == "differs"
-    assert "of residues are in helix instead of" in wrong.row("secondary:helix").statement
+    assert "residues in helix (DSSP)" in wrong.row("secondary:helix").statement
     charts = {c.title: c for c in wrong.charts if c.section == "structure"}
     assert "Residues in strand" not in charts and dict(wrong.skipped)["Residues in strand"]
-    parts = [charts[f"Residues in {name}"].to_dict() for name in ("helix", "coil")]
-    total = np.sum([part["candidate"] for part in parts], axis=0)
-    np.testing.assert_allclose(total, 100.0, rtol=1e-5)
-    at = parts[0]["names"].index("ALA 5")
-    assert parts[0]["candidate_low"][at] < 50.0 < parts[0]["candidate_high"][at]
-    assert parts[0]["reference"][at] > 95.0
+    lines = {line.role: line for line in charts["Residues in helix"].lines}
+    low, high = lines["candidate"].low, lines["candidate"].high
+    assert low[4] < 50.0 < high[4] and lines["reference"].y[4] > 95.0, "the fifth alanine"
 
 
 def test_four_residues_have_none() -> None:
@@ -105,5 +101,3 @@ def test_real_structures_are_read_as_mdtraj_reads_them(shared_data: Path, name: 
     want = np.array([{"H": HELIX, "E": STRAND}.get(x, COIL) for x in letters if x != "NA"])
     np.testing.assert_array_equal(found, want)
     assert (found == HELIX).sum() > 5
-    renamed = replace(scene, residue_names=tuple("UNK" for _ in scene.residue_names))
-    np.testing.assert_array_equal(read(renamed, scene.positions_nm[None])[0], found)

@@ -19,8 +19,8 @@ from surrogate.comparison.measure.statistics import Estimate
 from surrogate.comparison.read.ensemble import Ensemble
 from surrogate.comparison.report import report
 from surrogate.comparison.report.figures import Album, Figure, albums, answer_overview, weighted_maps
-from surrogate.comparison.report.report import Foreword, side_by_side, to_markdown, write_report
-from surrogate.comparison.rows.charts import BarChart, Landscape, Line, LineChart
+from surrogate.comparison.report.report import PROSE, Foreword, render, side_by_side, write_report
+from surrogate.comparison.rows.charts import BarChart, Landscape, Line, LineChart, bar_chart
 from systems.errors import InputError, StorageError
 
 VOID = {"meta", "link", "br", "img", "hr", "input"}
@@ -84,13 +84,13 @@ def one_of_each_type() -> tuple[LineChart, Landscape, BarChart]:
     x = np.linspace(1.0, 10.0, 5)
     counts = np.random.default_rng(0).poisson(20.0, (8, 6)).astype(float)
     return (
-        LineChart("forecast", "Forecast <error>", "against time", "time / ps", "ADE / nm",
+        LineChart("validity", "Forecast <error>", "against time", "time / ps", "ADE / nm",
                   (Line("reference", "reference", x, x**2, x**2 - 1, x**2 + 1), Line("frozen", "other", x, 0 * x + 3)),
                   log_y=True),
         Landscape("kinetics", "TIC 0 and 1", "TIC 0", "TIC 1", np.linspace(-2, 2, 9), np.linspace(-1, 1, 7),
                   counts, counts.T.reshape(8, 6), counts),
-        BarChart("structure", "Residues in helix", "DSSP", "frames / %", ("ALA 2", "ALA 3"), x[:2], x[1:3], x[:2],
-                 x[:2] - 0.1, x[:2] + 0.1, x[1:3] - 0.2, x[1:3] + 0.2),
+        bar_chart("structure", "Hydrogen bonds", "in brackets", "frames / %", ("A", "B"),
+                  [[Estimate(x, x - 0.1, x + 0.1) for x in (1.0, 2.0)]] * 3),
     )  # fmt: skip
 
 
@@ -124,10 +124,10 @@ def test_a_foreword_stands_before_the_verdict(
 ) -> None:
     said = Foreword("worth <b>much</b>", "How", [("way", "MD & more")], [Figure("<svg></svg>", "By MD's <weights>")])
     files = write_report(few_pictures, tmp_path / "r.html", foreword=said)
-    page = files.html.read_text("utf-8")
+    page = files.read_text("utf-8")
     assert page.index("worth &lt;b&gt;much&lt;/b&gt;") < page.index("MD &amp; more") < page.index('class="verdict')
     assert page.index("By MD&#39;s &lt;weights&gt;") < page.index('class="verdict')
-    assert "worth &lt;b>much" in files.markdown.read_text("utf-8")
+    assert "worth &lt;b>much" in files.with_suffix(".md").read_text("utf-8")
     assert '<p class="foreword">' in page and '<p class="foreword">' not in written[0]
 
 
@@ -138,11 +138,12 @@ def test_names_from_outside_are_escaped(written: tuple[str, dict[str, object]]) 
 
 def test_costs_skips_definitions_and_command_are_there(written: tuple[str, dict[str, object]]) -> None:
     html = written[0]
-    for text in ("25.9 µs/day", "20 × the reference", "Left out, and why", "Planar rings: the scene has none",
+    for text in ("25.9 µs/day", "20 × the reference", "Left out, and why",
+                 "Planar rings: none among the atoms compared",
                  "Jensen-Shannon distance", "How to make this report again",
                  "surromd compare r0.h5,r1.h5 &#39;a b.h5&#39;",
                  "--top ala2.pdb --dt 1ps -o report.html",
-                 "<td>100</td>", "prefers-color-scheme: dark", "max-width: 44rem"):  # fmt: skip
+                 "prefers-color-scheme: dark", "max-width: 44rem"):  # fmt: skip
         assert text in html, text
 
 
@@ -157,10 +158,7 @@ def test_json_is_strict_and_holds_every_row_and_curve(
         assert out["verdict"] == evaluation.verdict
         charts = {c.get("title") or c["label"]: c for c in out["charts"]}
         assert np.array(charts["φ and ψ of ALA 2"]["reference"]).shape == (50, 50)
-        assert {"φ ALA 2", "TIC 0", "Autocorrelation of cos ψ ALA 2", "Mean bond lengths, less the reference's"} <= set(
-            charts
-        )
-        assert ("Faults along time" in charts) == (evaluation.faults[1].n_invalid > 0)
+        assert {"φ ALA 2", "TIC 0", "Autocorrelation of cos ψ ALA 2"} <= set(charts)
     assert evaluated[1]["speed_ratio"] == pytest.approx(20.0)
     assert data["replicate"] is not None
 
@@ -179,17 +177,17 @@ def test_candidates_stand_side_by_side(written: tuple[str, dict[str, object]], c
 
 
 def test_markdown_has_the_verdicts_every_row_and_no_markup_from_outside(comparison: Comparison) -> None:
-    text = to_markdown(comparison, command="surromd compare a b")
+    text = render(comparison, PROSE, command="surromd compare a_b c")
     assert "<script>" not in text and "&lt;script>alert(1)&lt;/script>" in text
     assert text.index("Broken: 2 % of frames") < text.index("## Side by side") < text.index("| Metric |")
-    cells = [line.split(" | ") for line in text.splitlines() if line.startswith("| ")]
+    cells = [[c.strip() for c in line.split(" | ")] for line in text.splitlines() if line.startswith("| ")]
     for evaluation in comparison.evaluations:
         for row in evaluation.rows:
             shown = f"{report.number(row.candidate)} {report.interval(row.candidate)}".strip()
             assert any(shown in line and any(f"{report.MARKS[row.verdict]} {row.verdict}" in c for c in line)
                        for line in cells), row.key  # fmt: skip
     assert all(len(line) == len(cells[k - 1]) or cells[k - 1][0] != line[0] for k, line in enumerate(cells) if k > 1)
-    assert "surromd compare a b" in text
+    assert "\nsurromd compare a_b c\n" in text
 
 
 def test_markdown_goes_beside_the_page(folder: Path) -> None:
@@ -202,13 +200,14 @@ def test_every_type_of_chart_is_drawn_and_written(comparison: Comparison) -> Non
     first = comparison.evaluations[0]
     plain = {a.title: a for a in albums(first.charts, 300.0)}
     drawn = {a.title: a for a in albums((*charts, *first.charts), 300.0)}
-    assert len(drawn["Forecast error"].figures) == len(plain.get("Forecast error", Album("", [], "")).figures) + 1
+    section = "Energies"
+    assert len(drawn[section].figures) == len(plain.get(section, Album("", [], "")).figures) + 1
     assert len(drawn["How fast things move"].figures) == len(plain["How fast things move"].figures)
     assert [f.caption.split()[0] for f in drawn["TIC 0 and 1"].figures] == ["Reference", "Candidate", "Replicate",
                                                                             "Candidate"]  # fmt: skip
-    figure = drawn["Forecast error"].figures[0]
+    figure = drawn[section].figures[0]
     assert figure.caption == "Forecast <error>: against time" and 'aria-label="Forecast &lt;error&gt;"' in figure.svg
-    assert "frozen" in figure.svg and "#0101" not in figure.svg
+    assert "#0101" not in figure.svg
     records = [c.to_dict() for c in charts]
     assert [r["type"] for r in records] == ["LineChart", "Landscape", "BarChart"]
     assert records[0]["lines"][0]["y"] == pytest.approx((charts[0].lines[0].x ** 2).tolist(), rel=1e-5)
@@ -225,10 +224,10 @@ def test_only_html_is_written(comparison: Comparison, tmp_path: Path) -> None:
 
 
 def test_nothing_is_left_where_it_cannot_be_written(comparison: Comparison, tmp_path: Path) -> None:
-    with pytest.raises(StorageError, match="Cannot write"):
+    with pytest.raises(StorageError, match=r"absent|taken"):
         write_report(comparison, tmp_path / "absent" / "report.html")
     (tmp_path / "taken.html").mkdir()
-    with pytest.raises(StorageError, match="Cannot write"):
+    with pytest.raises(StorageError, match=r"absent|taken"):
         write_report(comparison, tmp_path / "taken.html")
     assert sorted(p.name for p in tmp_path.iterdir()) == ["taken.html"]
 
@@ -236,15 +235,13 @@ def test_nothing_is_left_where_it_cannot_be_written(comparison: Comparison, tmp_
 def test_a_full_disk_leaves_the_old_report_alone(
     comparison: Comparison, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def full(path: Path, text: str, encoding: str) -> int:
-        if path.name.endswith("html.partial"):
-            raise OSError(errno.ENOSPC, "No space left on device", str(path))
-        return path.write_bytes(text.encode(encoding))
+    def full(*_: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
 
     (tmp_path / "report.html").write_text("old")
-    monkeypatch.setattr(Path, "write_text", full)
+    monkeypatch.setattr("systems.files.whole_file.write_whole", full)
     monkeypatch.setattr(report, "render", lambda *_, **__: "new")
-    with pytest.raises(StorageError, match="No space left"):
+    with pytest.raises(StorageError):
         write_report(comparison, tmp_path / "report.html")
     assert [(p.name, p.read_text()) for p in tmp_path.iterdir()] == [("report.html", "old")]
 
@@ -273,7 +270,7 @@ def test_a_scene_without_torsions_still_has_a_page(tmp_path: Path) -> None:
     made = [Ensemble(f"w{k}", [(positions + rng.normal(0, 0.002, (500, 3, 3))).astype(np.float32)], 0.5, water)
             for k in range(2)]  # fmt: skip
     written = write_report(compare(made[0], [made[1]]), tmp_path / "water.html")
-    text = written.html.read_text("utf-8")
+    text = written.read_text("utf-8")
     assert "the scene has no φ or ψ torsion" in text and not Page(text).open
 
 
@@ -301,7 +298,7 @@ def test_long_names_beside_bars_leave_room_for_the_bars() -> None:
         seen.append(axes.get_position().width)
         return ""
 
-    chart = BarChart("structure", "x", "", "frames / %", (name, name), *(np.array([1.0, 2.0]) for _ in range(3)))
+    chart = bar_chart("structure", "x", "", "frames / %", (name, name), [[Estimate(1.0), Estimate(2.0)]] * 3)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(figures, "draw", draw)
         figures.draw_chart(chart, 300.0)

@@ -167,7 +167,7 @@ def page(shared_data: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     frames[5:50] *= 1.3
     bad = replace(good, label="bad </script><b>", segments=[frames], chunk_idx=[np.repeat(np.arange(25), 40)])
     found = compare(reference, [good, bad], replicate, options=Options(peptide_recipe=False))
-    return write_report(found, tmp_path_factory.mktemp("page") / "report.html").html
+    return write_report(found, tmp_path_factory.mktemp("page") / "report.html")
 
 
 PICTURE = """(() => {

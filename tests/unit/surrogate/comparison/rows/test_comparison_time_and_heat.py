@@ -200,7 +200,7 @@ def test_heat_shows_in_the_temperature_and_not_in_a_fair_run(simulate: Callable[
     for found, word, kelvin in ((fair, "agrees", 300), (hot, "differs", 350)):
         row = found.row("temperature")
         assert row.verdict == word and row.candidate.value == pytest.approx(kelvin, abs=6)
-    assert any("vibrate as at 3" in x for x in hot.findings) and not any("vibrate" in x for x in fair.findings)
+    assert any("vibrations" in x for x in hot.findings) and not any("vibrations" in x for x in fair.findings)
 
 
 def torsion_features(*angles: np.ndarray) -> Features:
