@@ -36,19 +36,16 @@ def windows(references: Trajectories, out: PathLike, options: WindowsOptions) ->
     is. `velocities` keeps these as well, for PAINET, and leaves frames in their own pose. Raises InputError when
     scenes, save intervals or conditions differ, TrajectoryError for damaged files.
     """
-    from surrogate.data import load_frames, write_windows
+    from surrogate.data import collect_frames
 
     out = Path(out)
     check_outputs([out], [".h5"], overwrite=options.overwrite)
     paths = find_trajectories(references, verify=True)
     held = [] if options.validation is None else find_trajectories(options.validation, verify=True)
     canonical = options.canonical and not options.velocities
-    write_windows(paths, out, canonical=canonical, velocities=options.velocities, held=held)
-    try:
-        load_frames(out).refuse_leaks()
-    except InputError:
-        out.unlink()
-        raise
+    frames = collect_frames(paths, canonical=canonical, velocities=options.velocities, held=held, spool=out.parent)
+    frames.refuse_leaks()
+    frames.save(out)
     return out
 
 
