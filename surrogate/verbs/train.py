@@ -76,13 +76,13 @@ def train(references: Trajectories, out: PathLike, options: TrainOptions) -> Pat
 
     `arch`: an installed architecture (`models.architecture.names`): lam-slide; lam-slide-peptides; painet or its
     decoder alone, egnn, which learn from velocities (a reference made with `save_velocities=True` and natural hydrogen
-    masses); or a baseline that is fitted in one go: frozen, constant-velocity, resampling, normal-modes, msm. The
-    others end after `budget_s` seconds of training or `steps` optimiser steps over all stages, whichever is given.
-    `start_from`: weights (name or file) whose second stage is trained further, with their configuration. `validation`:
-    trajectories that the curves are measured on; without any it is the last twentieth of each; molecules that are in
-    `validation` alone are held out whole. A stretch of motion that would be both trained on and validated on is
-    refused. `longest_lag_ps`: every spacing of frames from that of the references to this one is learned. `device`:
-    'auto', 'cpu' or 'cuda'; several devices by torchrun (surrogate.training.devices).
+    masses); or a baseline that is fitted in one go: frozen, resampling, normal-modes. The others end after `budget_s`
+    seconds of training or `steps` optimiser steps over all stages, whichever is given. `start_from`: weights (name or
+    file) whose second stage is trained further, with their configuration. `validation`: trajectories that the curves
+    are measured on; without any it is the last twentieth of each; molecules that are in `validation` alone are held out
+    whole. A stretch of motion that would be both trained on and validated on is refused. `longest_lag_ps`: every
+    spacing of frames from that of the references to this one is learned. `device`: 'auto', 'cpu' or 'cuda'; several
+    devices by torchrun (surrogate.training.devices).
 
     Beside `out`, a CSV holds the training curves and, until done, files the state that `resume` goes on from; at the
     end the curves are drawn (.svg), and a short rollout that is checked frame by frame says whether the weights are

@@ -6,7 +6,7 @@ import copy
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import ClassVar, cast
+from typing import Any, ClassVar, cast
 
 import torch
 from torch import Tensor, nn
@@ -45,8 +45,8 @@ class AutoencoderConfig:
 
 @dataclass(frozen=True)
 class ApproximatorConfig:
-    """Stage two. `interpolant` 'linear' or 'gvp' (eq. 7, 8). `precondition` scales skip and output of the data
-    prediction by the flow time so that its error vanishes with the noise (Karras 2022, for this path)."""
+    """Stage two. `precondition` scales skip and output of the data prediction by the flow time so that its error
+    vanishes with the noise (Karras 2022, for this path)."""
 
     chunk_frames: int = 32
     n_conditioning: int = 1
@@ -55,7 +55,6 @@ class ApproximatorConfig:
     width: int = 256
     n_layers: int = 7
     n_heads: int = 4
-    interpolant: str = "linear"
     precondition: bool = True
     # Conditioning frames see neither the flow time nor the frames that follow them, so that a chunk's evaluations
     # compute them once; False is the paper.
@@ -86,6 +85,14 @@ class LamSlideConfig(ModelConfig):
     position_scale_nm: float = 0.2
     autoencoder: AutoencoderConfig = field(default_factory=AutoencoderConfig)
     approximator: ApproximatorConfig = field(default_factory=ApproximatorConfig)
+
+    @classmethod
+    def from_dict(cls, record: dict[str, Any]) -> LamSlideConfig:
+        """See `ModelConfig.from_dict`; the interpolant that older weights name is always the linear one."""
+        stage_two = record.get("approximator")
+        if isinstance(stage_two, dict) and stage_two.get("interpolant") == "linear":
+            record = record | {"approximator": {k: v for k, v in stage_two.items() if k != "interpolant"}}
+        return super().from_dict(record)
 
 
 # Stage one: a cross-attention encoder into a few latent vectors and a decoder queried by identifier (section 3.3).
@@ -278,10 +285,9 @@ class Approximator(nn.Module):
         return memory
 
     def _denoise(self, o: Tensor, tau: Tensor, network: Callable[[Tensor], Tensor]) -> Tensor:
-        c = self.config
-        if not c.precondition:
+        if not self.config.precondition:
             return network(o)
-        skip, out, scale_in = (flow.expand(v, o) for v in flow.preconditioning(tau, c.interpolant))
+        skip, out, scale_in = (flow.expand(v, o) for v in flow.preconditioning(tau))
         return skip * o + out * network(o * scale_in)
 
     def _network(self, o: Tensor, time: Tensor, conditioning: Tensor) -> Tensor:
@@ -336,12 +342,12 @@ class LamSlide(Propagator):
 
     arch: ClassVar[str] = "lam-slide"
     float32_layers: tuple[str, ...] = ("autoencoder.to_position",)
+    solvers: tuple[str, ...] = ("multistep", "fitted", "euler")
     config: LamSlideConfig
 
     def __init__(self, config: LamSlideConfig) -> None:
         super().__init__()
         self.config = config
-        self.solvers = flow.solvers_for(config.approximator.interpolant)
         self.n_conditioning = config.approximator.n_conditioning
         n_latents, latent_dim = config.autoencoder.n_latents, config.autoencoder.latent_dim
         self.autoencoder = Autoencoder(config.autoencoder)
@@ -401,18 +407,11 @@ class LamSlide(Propagator):
     def next_chunk(self, last_frames_nm: Tensor, molecule: Molecule, noise: Tensor, *, solver_steps: int = 10,
                    solver: str | None = None, last_velocities_nm_ps: Tensor | None = None) -> Chunk:  # fmt: skip
         """See `Propagator.next_chunk`. Velocities play no part."""
-        solver = solver or self.solvers[0]
-        if solver in flow.ADAPTIVE and len(noise) > 1:
-            pairs = zip(last_frames_nm.split(1), noise.split(1), strict=True)
-            rows = [self.next_chunk(x, molecule, n, solver_steps=solver_steps, solver=solver) for x, n in pairs]
-            mean = sum(row.evaluations or 0.0 for row in rows) / len(rows)
-            return Chunk(torch.cat([row.frames_nm for row in rows]), evaluations=mean)
-        c = self.config.approximator
         # Frames that training turned at random, it had about their middle.
         middle_nm = 0.0 if self.config.canonical else last_frames_nm[:, -1:].mean(-2, keepdim=True)
         known = self.encode(last_frames_nm - middle_nm, molecule.elements)
         lag = self.embedded_lag(None, len(known))
-        memory = self.approximator.remember(known, lag) if c.clean_conditioning else None
+        memory = self.approximator.remember(known, lag) if self.config.approximator.clean_conditioning else None
         evaluations = 0
 
         def predict(o: Tensor, tau: Tensor) -> Tensor:
@@ -420,6 +419,6 @@ class LamSlide(Propagator):
             evaluations += 1
             return self.approximator(o, tau, known, memory, lag)
 
-        latents = flow.SOLVERS[solver](predict, noise, solver_steps, c.interpolant)
+        latents = flow.SOLVERS[solver or self.solvers[0]](predict, noise, solver_steps)
         frames = self.decode(latents[:, self.n_conditioning :], last_frames_nm.shape[-2])
         return Chunk(frames + middle_nm, evaluations=float(evaluations))

@@ -94,14 +94,12 @@ def flow_loss(
     c = model.config.approximator
     known = latents[:, : c.n_conditioning]
     noise = torch.randn(latents.shape, generator=generator).to(latents.device)
-    alpha, sigma, _, _ = (flow.expand(v, latents) for v in flow.coefficients(tau, c.interpolant))
-    noisy = alpha * latents + sigma * noise
     first = 0 if c.loss_on_given else c.n_conditioning
-    prediction = model.approximator(noisy, tau, known, lag=lag)[:, first:]
+    prediction = model.approximator(flow.mixed(latents, noise, tau), tau, known, lag=lag)[:, first:]
     target = latents[:, first:]
     weight = torch.ones_like(tau)
     if c.precondition:
-        weight = flow.preconditioning(tau, c.interpolant)[1].square().reciprocal()
+        weight = flow.preconditioning(tau)[1].square().reciprocal()
     loss = ((prediction - target).square().flatten(1).mean(1) * weight).mean()
     terms = {"flow": loss.detach()}
     if c.auxiliary_frames and (c.position_weight or c.distance_weight):

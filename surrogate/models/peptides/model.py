@@ -213,7 +213,6 @@ def generators(noise: Tensor, place: int, attempt: int = 0) -> list[torch.Genera
 
 # Residues further apart along the chain are alike far.
 _FAR = 6
-_SOLVERS = ("gaussian", "angular", *flow.solvers_for("linear"))
 _MOST_CORRELATED = 0.995
 _LONGEST_WAVE = 4.0
 # Chunks that disobey the states that were drawn for them, or whose atoms overlap, are drawn again so often.
@@ -294,7 +293,7 @@ class PeptideFlow(nn.Module):
 
     def forward(self, o: Tensor, tau: Tensor, conditioning: Conditioning) -> Tensor:
         """`o` (b, t, r, slots), `tau` (b,), or (1,) of all -> like `o`."""
-        skip, out, scale_in = (flow.expand(v, o) for v in flow.preconditioning(tau, "linear"))
+        skip, out, scale_in = (flow.expand(v, o) for v in flow.preconditioning(tau))
         return skip * o + out * self._network(o * scale_in, tau, conditioning)
 
     def conditioning(self, known: Tensor, times_ps: Tensor, places: Tensor, states: Tensor) -> Conditioning:
@@ -352,9 +351,9 @@ class PeptideSlide(Propagator):
         if config.scale is None or not config.types:
             raise InputError("a model of peptides needs the scale of their coordinates and their residue types.")
         self.config = config
-        if config.usual_solver not in _SOLVERS:
-            raise InputError(f"usual_solver = {config.usual_solver!r} is none of {', '.join(_SOLVERS)}.")
-        self.solvers = tuple(dict.fromkeys((config.usual_solver, *_SOLVERS)))
+        if config.usual_solver not in flow.SOLVERS:
+            raise InputError(f"usual_solver = {config.usual_solver!r} is none of {', '.join(flow.SOLVERS)}.")
+        self.solvers = tuple(dict.fromkeys((config.usual_solver, *flow.SOLVERS)))
         self.usual_steps = config.usual_steps
         n_types, n_slots = len(config.types) + len(ENDS), config.scale.n_slots
         self.flow = PeptideFlow(config, n_slots)
@@ -476,7 +475,7 @@ class PeptideSlide(Propagator):
                 evaluations += len(rows) / len(known)
                 return torch.where(filled, self.flow(o, tau, conditioning), 0.0)
 
-            y = flow.SOLVERS[solver or self.solvers[0]](predict, drawn, solver_steps, "linear")
+            y = flow.SOLVERS[solver or self.solvers[0]](predict, drawn, solver_steps)
             tokens = self._tokens(self.from_innovations(y, known[rows], times[rows], types), states[rows], chain)
             resolved = mended(tokens.flatten(0, 1), states[rows].flatten(0, 1), chain)
             frames, astray, crowded = (x.unflatten(0, tokens.shape[:2]) for x in resolved)

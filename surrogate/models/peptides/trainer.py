@@ -428,12 +428,11 @@ def peptide_loss(
     draws = torch.randn(len(numbers), generator=generator) * c.tau_scale + c.tau_location
     tau = torch.sigmoid(draws).clamp(max=TAU_MAX).to(numbers.device)
     noise = torch.randn(target.shape, generator=generator).to(numbers.device) * filled
-    alpha, sigma, _, _ = (flow.expand(v, target) for v in flow.coefficients(tau, "linear"))
     conditioning = model.flow.conditioning(
         known, times_ps, chain.places, chains.conditioning_states(states, chain.stated.counts)
     )
-    found = model.flow(alpha * target + sigma * noise, tau, conditioning)
-    weight = flow.expand(flow.preconditioning(tau, "linear")[1].square().reciprocal(), target)
+    found = model.flow(flow.mixed(target, noise, tau), tau, conditioning)
+    weight = flow.expand(flow.preconditioning(tau)[1].square().reciprocal(), target)
     loss, turning, stiff = by_kind((found - target).square() * weight, chain, c)
     return loss, {"flow": loss.detach(), "turning": turning.detach(), "stiff": stiff.detach()}
 
