@@ -202,11 +202,11 @@ def _plan(references: Trajectories, validation: Trajectories | None, asked: Trai
 def _suited(references: References) -> tuple[str, str]:
     """Return the name of the architecture that suits the references best, and why."""
     survey = references.survey
-    fits = [(fit, name) for name in names() if (fit := architecture(name).suits(survey)) is not None]
+    fits = [(*fit, name) for name in names() if (fit := architecture(name).suits(survey)) is not None]
     if not fits:
         raise InputError("no installed architecture suits these references by itself; name one with `arch`.")
-    best, name = max(fits, key=lambda found: found[0].rank)
-    return name, best.reason
+    _, why, name = max(fits)
+    return name, why
 
 
 @contextmanager

@@ -460,8 +460,8 @@ class LamSlideTrainer(arch.Trainer):
         return arch.Prepared(frames.scene.name, run)
 
 
-def _suits(survey: Survey) -> arch.Suitability | None:
-    return arch.Suitability(0, "one molecule") if survey.one_molecule else None
+def _suits(survey: Survey) -> tuple[int, str] | None:
+    return (0, "one molecule") if survey.one_molecule else None
 
 
 LAM_SLIDE = arch.Architecture("lam-slide", LamSlideConfig.from_dict, LamSlide, LamSlideTrainer, _suits)

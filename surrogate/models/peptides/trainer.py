@@ -529,7 +529,7 @@ def _under_standard_names(frames: TrainingFrames) -> TrainingFrames:
     )  # fmt: skip
 
 
-def _suits(survey: Survey) -> arch.Suitability | None:
+def _suits(survey: Survey) -> tuple[int, str] | None:
     if len(survey.scenes) < 2:
         return None
     try:
@@ -537,7 +537,7 @@ def _suits(survey: Survey) -> arch.Suitability | None:
             chain_layout(scene)
     except InputError:
         return None
-    return arch.Suitability(10, f"{len(survey.scenes)} peptides, known by their residues in internal coordinates")
+    return 10, f"{len(survey.scenes)} peptides, known by their residues in internal coordinates"
 
 
 PEPTIDES = arch.Architecture("lam-slide-peptides", PeptideConfig.from_dict, PeptideSlide, PeptideTrainer, _suits)
