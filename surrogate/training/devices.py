@@ -35,7 +35,6 @@ _PRODUCT = (64, 256, 1792)
 _ROUNDS = 7
 # Steps that are timed on each number of cores, and after how many it is asked again.
 _TIMED_STEPS, _STEPS_BETWEEN = 8, 500
-_UNITS = (("AMX", "_is_amx_tile_supported"), ("avx512_bf16", "_is_avx512_bf16_supported"))
 
 
 @dataclass(frozen=True)
@@ -52,9 +51,8 @@ class Precision:
 
 @dataclass(frozen=True)
 class ProductSpeed:
-    """Speed of matrix products on this processor, a batch through a layer, in GFLOP/s; `unit` as `bf16_unit` has it."""
+    """Speed of matrix products on this processor, a batch through a layer, in GFLOP/s."""
 
-    unit: str
     fp32_gflops: float
     bf16_gflops: float
     threads: int
@@ -64,11 +62,10 @@ class ProductSpeed:
         return self.bf16_gflops / self.fp32_gflops
 
     def describe(self) -> str:
-        """Return 'avx512_bf16; products on 1 thread: fp32 70 GFLOP/s, bf16 310 GFLOP/s (4.4 times as fast)'."""
-        threads = f"{self.threads} thread{'s' if self.threads > 1 else ''}"
+        """Return 'products (threads: 1): fp32 70 GFLOP/s, bf16 310 GFLOP/s (4.4 times as fast)'."""
         return (
-            f"{self.unit or 'neither AMX nor avx512_bf16'}; products on {threads}: fp32 "
-            f"{self.fp32_gflops:.3g} GFLOP/s, bf16 {self.bf16_gflops:.3g} GFLOP/s ({self.ratio:.2g} times as fast)"
+            f"products (threads: {self.threads}): fp32 {self.fp32_gflops:.3g} GFLOP/s, bf16 {self.bf16_gflops:.3g} "
+            f"GFLOP/s ({self.ratio:.2g} times as fast)"
         )
 
 
@@ -84,9 +81,7 @@ def choose_precision(wanted: str, *, suits: bool = True) -> Precision:
     if not suits:
         return Precision(False, "this model is exact in fp32 alone")
     speed = product_speed()
-    through = f" through {speed.unit}" if speed.unit else ""
-    reason = f"products in bf16{through} are {speed.ratio:.2g} times as fast as in fp32 here"
-    return Precision(speed.ratio >= _PAYS, reason)
+    return Precision(speed.ratio >= _PAYS, f"products in bf16 are {speed.ratio:.2g} times as fast as in fp32 here")
 
 
 def bf16_pays(device_type: str) -> bool:
@@ -112,17 +107,7 @@ def product_speed() -> ProductSpeed:
                 torch.nn.functional.linear(x, weight)
                 best[dtype] = min(best[dtype], time.perf_counter() - started)
     gflop = 2e-9 * rows * n_in * n_out
-    fp32, bf16 = gflop / best[torch.float32], gflop / best[torch.bfloat16]
-    return ProductSpeed(bf16_unit(), fp32, bf16, torch.get_num_threads())
-
-
-def bf16_unit() -> str:
-    """Return what this processor has for bf16: 'AMX', 'avx512_bf16', or '' where torch knows of nothing."""
-    for name, question in _UNITS:
-        asked = getattr(torch.cpu, question, None)
-        if asked is not None and asked():
-            return name
-    return ""
+    return ProductSpeed(gflop / best[torch.float32], gflop / best[torch.bfloat16], torch.get_num_threads())
 
 
 @contextmanager

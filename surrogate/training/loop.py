@@ -69,20 +69,13 @@ class Muon(torch.optim.Optimizer):
                     alike[p.shape].append(p)
             for shape, matrices in alike.items():
                 grads = [p.grad for p in matrices if p.grad is not None]
-                momenta = [self._momentum(p) for p in matrices]
+                momenta = [self.state[p].setdefault("momentum", torch.zeros_like(p)) for p in matrices]
                 torch._foreach_lerp_(momenta, grads, 1.0 - MOMENTUM)
                 way = orthogonalised(torch.stack(torch._foreach_lerp(grads, momenta, MOMENTUM)))
                 weights: list[Tensor] = list(matrices)
                 torch._foreach_mul_(weights, 1.0 - group["lr"] * group["weight_decay"])
                 longer = max(1.0, shape[0] / shape[1]) ** 0.5
                 torch._foreach_add_(weights, list(way.unbind()), alpha=-group["lr"] * longer)
-
-    def _momentum(self, p: nn.Parameter) -> Tensor:
-        state = self.state[p]
-        if not state:
-            state["momentum"] = torch.zeros_like(p)
-        momentum: Tensor = state["momentum"]
-        return momentum
 
 
 # The curves of a training: a CSV that the loop writes, and NAME.svg beside it.
@@ -271,6 +264,21 @@ class Ema:
             p.copy_(self.shadow[name])
 
 
+@dataclass(frozen=True, eq=False)
+class Stage:
+    """One stage of a training: the `module` that it trains, and how.
+
+    `loss(generator)` draws its own batch from the generator, so that a resumed run draws what an uninterrupted one
+    would have. `saves`: weights are written at each validation, not after the last stage alone.
+    """
+
+    module: nn.Module
+    config: StageConfig
+    loss: LossFn
+    validate: Callable[[], dict[str, float]]
+    saves: bool = True
+
+
 @dataclass(frozen=True)
 class StagePlace:
     """Where a stage runs and writes: its resume `state` (.safetensors), the `log` of its curves (.csv), the device.
@@ -282,25 +290,16 @@ class StagePlace:
     resume: bool = False
 
 
-def run_stage(
-    module: nn.Module,
-    config: StageConfig,
-    loss_fn: LossFn,
-    validate_fn: Callable[[], dict[str, float]],
-    place: StagePlace,
-    *,
-    progress: ProgressFn | None = None,
-    on_save: Callable[[float], None] | None = None,
-) -> float:
-    """Train `module` in place and leave it holding its EMA weights; return the seconds of training spent.
+def run_stage(stage: Stage, place: StagePlace, *, progress: ProgressFn | None = None,
+              on_save: Callable[[float], None] | None = None) -> float:  # fmt: skip
+    """Train a stage's module in place and leave it holding its EMA weights; return the seconds of training spent.
 
-    `loss_fn(generator)` draws its own batch from the generator, so that a resumed run draws what an uninterrupted one
-    would have. Each validation logs a CSV row, saves the resume state and calls `on_save(spent_s)` with EMA weights in.
-    Of several processes (training.devices) each draws its own batches, and the first alone validates and writes.
-    Raises SimulationError when the loss stops being finite; the last saved state stays.
+    Each validation logs a CSV row, saves the resume state and calls `on_save(spent_s)` with EMA weights in. Of several
+    processes (training.devices) each draws its own batches, and the first alone validates and writes. Raises
+    SimulationError when the loss stops being finite; the last saved state stays.
     """
     devices.keep_freed_memory()
-    device = place.device
+    module, config, device = stage.module, stage.config, place.device
     fabric = devices.open_fabric(device.type, config.bf16 and devices.bf16_pays(device.type))
     optimisers = optimisers_of(module, config)
     rates = [[group["lr"] for group in optimiser.param_groups] for optimiser in optimisers]
@@ -322,7 +321,7 @@ def run_stage(
             for group, rate in zip(optimiser.param_groups, full, strict=True):
                 group["lr"] = rate * factor
         with fabric.autocast():
-            loss, terms = loss_fn(generator)
+            loss, terms = stage.loss(generator)
         module.zero_grad(set_to_none=True)
         loss.backward()
         now = time.monotonic()
@@ -349,7 +348,7 @@ def run_stage(
                 sums, n_summed = {}, 0
                 continue
             with ema.swapped(module):
-                metrics = {f"train_{k}": float(v) / n_summed for k, v in sums.items()} | validate_fn()
+                metrics = {f"train_{k}": float(v) / n_summed for k, v in sums.items()} | stage.validate()
                 if on_save is not None:
                     on_save(spent_s)
             sums, n_summed = {}, 0
@@ -364,18 +363,6 @@ def run_stage(
             progress(config.name, config.share_done(step, spent_s), {})
     ema.copy_to(module)
     return spent_s
-
-
-@dataclass(frozen=True, eq=False)
-class Stage:
-    """One stage of a training: the `module` that it trains, and `config`, `loss` and `validate` as `run_stage` takes
-    them. `saves`: weights are written at each validation, not after the last stage alone."""
-
-    module: nn.Module
-    config: StageConfig
-    loss: LossFn
-    validate: Callable[[], dict[str, float]]
-    saves: bool = True
 
 
 def train_stages(
@@ -410,17 +397,7 @@ def train_stages(
             write([*spent_s, now_s])
 
         place = StagePlace(out.with_name(f"{out.stem}.{stage.config.name}.train.safetensors"), log, device, resume)
-        spent_s.append(
-            run_stage(
-                stage.module,
-                stage.config,
-                stage.loss,
-                stage.validate,
-                place,
-                progress=progress,
-                on_save=save if stage.saves else None,
-            )
-        )
+        spent_s.append(run_stage(stage, place, progress=progress, on_save=save if stage.saves else None))
     if devices.is_first_process():
         write(spent_s)
     forget()
@@ -430,15 +407,13 @@ def train_stages(
 def optimisers_of(module: nn.Module, config: StageConfig) -> list[torch.optim.Optimizer]:
     """Return AdamW and, with `matrix_rate`, Muon, which share a module's parameters."""
     matrices: list[nn.Parameter] = []
-    decay: list[nn.Parameter] = []
-    plain: list[nn.Parameter] = []
     if config.matrix_rate is not None:
         layers = [layer for layer in module.modules() if isinstance(layer, nn.Linear)]
         own = [p for layer in layers for p in layer.parameters(recurse=False) if p.requires_grad]
         matrices = [p for p in own if p.ndim == 2 and min(p.shape) >= LEAST_MATRIX]
     taken = {id(p) for p in matrices}
-    for p in (p for p in module.parameters() if p.requires_grad and id(p) not in taken):
-        (decay if p.ndim >= 2 else plain).append(p)
+    others = [p for p in module.parameters() if p.requires_grad and id(p) not in taken]
+    decay, plain = [p for p in others if p.ndim >= 2], [p for p in others if p.ndim < 2]
     adam = torch.optim.AdamW(
         [{"params": decay, "weight_decay": config.weight_decay}, {"params": plain, "weight_decay": 0.0}],
         lr=config.learning_rate,
@@ -471,11 +446,6 @@ class StateHeader:
     matrix_rate: float | None = None
 
 
-def _prefix(number: int) -> str:
-    """Return what the tensors of an optimiser are called by; the first has no number."""
-    return f"optimiser{number or ''}."
-
-
 def save_state(path: Path, module: nn.Module, ema: Ema, optimisers: list[torch.optim.Optimizer], generators: Tensor,
                step: int, spent_s: float, config: StageConfig) -> None:  # fmt: skip
     """Write the training state whole or not at all."""
@@ -483,7 +453,7 @@ def save_state(path: Path, module: nn.Module, ema: Ema, optimisers: list[torch.o
     tensors |= {f"ema.{k}": v for k, v in ema.shadow.items()}
     for number, optimiser in enumerate(optimisers):
         for index, state in optimiser.state_dict()["state"].items():
-            tensors |= {f"{_prefix(number)}{index}.{k}": v for k, v in state.items()}
+            tensors |= {f"optimiser{number or ''}.{index}.{k}": v for k, v in state.items()}
     tensors["generator"] = generators
     header = StateHeader(step, spent_s, config.name, config.seed, config.batch, config.matrix_rate)
     save_tensors(path, "surromd_training", asdict(header), tensors)
@@ -514,7 +484,7 @@ def load_state(path: Path, module: nn.Module, ema: Ema, optimisers: list[torch.o
         ema.shadow[name].copy_(tensor)
     for number, optimiser in enumerate(optimisers):
         state: dict[int, dict[str, Tensor]] = {}
-        for key, tensor in sub(_prefix(number)).items():
+        for key, tensor in sub(f"optimiser{number or ''}.").items():
             index, name = key.split(".", 1)
             state.setdefault(int(index), {})[name] = tensor
         optimiser.load_state_dict({"state": state, "param_groups": optimiser.state_dict()["param_groups"]})

@@ -113,12 +113,12 @@ def test_a_budget_is_for_all_that_a_training_takes(tmp_path: Path, monkeypatch: 
             clock[0] += len(positions_nm)
             return super().label(positions_nm)
 
-    def stage(model: Any, config: Any, *_: Any, **__: Any) -> float:
-        stages.append(config)
+    def run(stage: Any, *_: Any, **__: Any) -> float:
+        stages.append(stage.config)
         return 0.0
 
     monkeypatch.setattr(trainer.time, "monotonic", lambda: clock[0])
-    monkeypatch.setattr(loop, "run_stage", stage)
+    monkeypatch.setattr(loop, "run_stage", run)
     config = replace(QUICK, steps=None, budget_s=200.0)
     learn_potential(Slow(), tmp_path / "a.safetensors", SMALL, config, before_s=15.0, after_s=20.0)
     # 15 before, 400 frames of MD at two temperatures, 24 first labels, 20 for what comes after.

@@ -15,7 +15,7 @@ from surrogate.data import TrainingFrames, collect_frames, is_windows, load_fram
 from surrogate.models.lam_slide.model import LamSlide, LamSlideConfig, draw_identifiers
 from surrogate.models.lam_slide.trainer import TrainingConfig, flow_loss, train_lam_slide, window_frames
 from surrogate.models.weights import Weights, load_weights, provenance_of, read_header, save_weights
-from surrogate.training.loop import StageConfig, StagePlace, learning_rate_factor, run_stage
+from surrogate.training.loop import Stage, StageConfig, StagePlace, learning_rate_factor, run_stage
 from systems.errors import InputError, SimulationError, WeightsError
 from systems.options import read_toml
 from systems.scene import Scene
@@ -119,7 +119,7 @@ def test_training_stops_on_nan_and_says_where(tmp_path: Path) -> None:
         return module(torch.full((1, 2), float("nan"))).sum(), {}
 
     with pytest.raises(SimulationError, match="not finite at step 0"):
-        run_stage(module, StageConfig("toy", 1, 1e-3, steps=3, bf16=False), loss_fn, dict,
+        run_stage(Stage(module, StageConfig("toy", 1, 1e-3, steps=3, bf16=False), loss_fn, dict),
                   StagePlace(tmp_path / "s", tmp_path / "l.csv", torch.device("cpu")))  # fmt: skip
     assert torch.isfinite(module.weight).all(), "the last good parameters are kept"
 

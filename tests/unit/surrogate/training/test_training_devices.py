@@ -15,6 +15,7 @@ from surrogate.progress import progress_bar
 from surrogate.training.devices import choose_device, is_first_process
 from surrogate.training.loop import (
     Muon,
+    Stage,
     StageConfig,
     StagePlace,
     append_row,
@@ -33,7 +34,7 @@ from pathlib import Path
 import torch
 from torch import nn
 from surrogate.training.devices import open_fabric
-from surrogate.training.loop import StageConfig, StagePlace, run_stage
+from surrogate.training.loop import Stage, StageConfig, StagePlace, run_stage
 
 folder = Path(sys.argv[1])
 fabric = open_fabric("cpu", False)
@@ -47,7 +48,7 @@ def loss(generator):
     return (model(x) - x.sum(1, keepdim=True)).square().mean(), {}
 
 stage = StageConfig("line", 4, 1e-2, steps=30, warmup_steps=1, bf16=False, validate_every_s=1e9)
-run_stage(model, stage, loss, lambda: {},
+run_stage(Stage(model, stage, loss, lambda: {}),
           StagePlace(folder / "s.train.safetensors", folder / "l.csv", torch.device("cpu")))
 torch.save({"x": torch.stack(seen), "weights": model.state_dict(), "world": fabric.world_size},
            folder / f"rank{fabric.global_rank}.pt")
@@ -86,7 +87,7 @@ def test_two_processes_train_one_model_on_twice_the_data(tmp_path: Path) -> None
 
 
 def run(folder: Path, model: nn.Module, loss, stage: StageConfig) -> None:
-    run_stage(model, stage, loss, dict,
+    run_stage(Stage(model, stage, loss, dict),
               StagePlace(folder / "s.train.safetensors", folder / "l.csv", torch.device("cpu")))  # fmt: skip
 
 
