@@ -17,6 +17,7 @@ from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import lru_cache
+from itertools import combinations
 from pathlib import Path
 from typing import Any, ClassVar, NamedTuple, cast
 
@@ -26,7 +27,7 @@ import torch
 from torch import Tensor, nn
 
 from md_reference import simd as engine
-from surrogate.models.painet.model import EnergyAttention, TypeGroups, type_groups
+from surrogate.models.painet.model import EnergyAttention, TypeGroups, bond_paths, type_groups
 from surrogate.models.potential import TOLERANCE, Bath, GradientFn, IntegratorConfig, Potential, at_rest, gradient_of
 from surrogate.models.propagator import Molecule
 from systems.errors import InputError
@@ -144,18 +145,7 @@ class EdgeGeometry(NamedTuple):
 
 def bonded_shells(molecule: Molecule) -> dict[tuple[int, int], int]:
     """Return how many bonds less one lie between atoms (i, j), i < j, up to three."""
-    neighbours: list[list[int]] = [[] for _ in range(molecule.n_atoms)]
-    for i, j in molecule.bonds.tolist():
-        neighbours[i].append(j)
-        neighbours[j].append(i)
-    shells: dict[tuple[int, int], int] = {}
-    for start in range(molecule.n_atoms):
-        seen, front = {start}, {start}
-        for shell in range(N_SHELLS - 1):
-            front = {k for j in front for k in neighbours[j]} - seen
-            seen |= front
-            shells |= {(start, k): shell for k in front if k > start}
-    return shells
+    return {pair: n - 1 for pair, n in bond_paths(molecule, N_SHELLS - 1).items()}
 
 
 def find_edges(
@@ -164,13 +154,13 @@ def find_edges(
     """Return the edges of frames `(rows, n_atoms, 3)` nm of a molecule: those that any of the frames needs."""
     n_atoms = positions_nm.shape[1]
     dense = n_atoms <= few
-    pairs = _all_pairs(n_atoms) if dense else {}
-    if not dense:
+    if dense:
+        pairs = _all_pairs(n_atoms)
+    else:
         from scipy.spatial import cKDTree
 
-        for frame in positions_nm.detach().cpu().double().numpy():
-            near: np.ndarray = cKDTree(frame).query_pairs(cutoff_nm, output_type="ndarray")
-            pairs |= {(int(i), int(j)): N_SHELLS - 1 for i, j in near}
+        trees = map(cKDTree, positions_nm.detach().cpu().double().numpy())
+        pairs = {pair: N_SHELLS - 1 for tree in trees for pair in tree.query_pairs(cutoff_nm)}
     pairs |= shells
     own = [(i, i, N_SHELLS - 1) for i in range(n_atoms)] if dense else []
     both = sorted([(i, j, s) for (i, j), s in pairs.items()] + [(j, i, s) for (i, j), s in pairs.items()] + own)
@@ -179,7 +169,7 @@ def find_edges(
 
 
 def _all_pairs(n_atoms: int) -> dict[tuple[int, int], int]:
-    return {(i, j): N_SHELLS - 1 for i in range(n_atoms) for j in range(i + 1, n_atoms)}
+    return dict.fromkeys(combinations(range(n_atoms), 2), N_SHELLS - 1)
 
 
 def measure_edges(
@@ -345,20 +335,16 @@ class EnergyNetwork(nn.Module):
         elements = fabric.molecule.elements
         self.nearest_nm.zero_()
         self.farthest_nm.fill_(NO_WALL_NM)
-        nearest: dict[tuple[int, int, int], float] = {}
-        farthest: dict[tuple[int, int, int], float] = {}
+        extremes: dict[tuple[int, int, int], tuple[float, float]] = {}
         for (i, j), shell in (_all_pairs(len(elements)) | fabric.shells).items():
             distance = (positions_nm[:, i] - positions_nm[:, j]).norm(dim=-1)
-            low, high = sorted((int(elements[i]), int(elements[j])))
-            kind = (shell, low, high)
-            nearest[kind] = min(nearest.get(kind, NO_WALL_NM), float(distance.min()))
-            farthest[kind] = max(farthest.get(kind, 0.0), float(distance.max()))
-        for (shell, low, high), shortest in nearest.items():
-            longest = farthest[shell, low, high]
-            for a, b in ((low, high), (high, low)):
-                self.nearest_nm[shell, a, b] = shortest / WALL_MARGIN
-                if shell < WALLED_SHELLS:
-                    self.farthest_nm[shell, a, b] = longest * WALL_MARGIN
+            types = shell, *sorted((int(elements[i]), int(elements[j])))
+            least, most = extremes.get(types, (NO_WALL_NM, 0.0))
+            extremes[types] = min(least, float(distance.min())), max(most, float(distance.max()))
+        for (shell, a, b), (shortest, longest) in extremes.items():
+            self.nearest_nm[shell, [a, b], [b, a]] = shortest / WALL_MARGIN
+            if shell < WALLED_SHELLS:
+                self.farthest_nm[shell, [a, b], [b, a]] = longest * WALL_MARGIN
 
     def prepare(self, fabric: Fabric, positions_nm: Tensor) -> EdgeWeights:
         """Return what depends on the molecule, and on frames `(rows, n_atoms, 3)` nm by who is near whom."""
@@ -375,11 +361,11 @@ class EnergyNetwork(nn.Module):
 
     def forward(self, positions_nm: Tensor, fabric: Fabric, made: EdgeWeights) -> Tensor:
         """Frames `(rows, n_atoms, 3)` nm -> energies `(rows, n_members)`."""
-        c, kind = self.config, made.of_atom.dtype
+        c, dtype = self.config, made.of_atom.dtype
         x = positions_nm.transpose(0, 1)
-        seen = measure_edges(x, made.edges, c.n_radial, c.cutoff_nm, kind)
+        seen = measure_edges(x, made.edges, c.n_radial, c.cutoff_nm, dtype)
         # Vectors in units of 0.1 nm, about the mean, before they lose digits.
-        x = ((x - x.mean(0)) * 10.0).to(kind).transpose(0, 1)
+        x = ((x - x.mean(0)) * 10.0).to(dtype).transpose(0, 1)
         h = made.of_atom[:, None].expand(-1, len(positions_nm), -1)
         carried = None
         dense = c.attention == "dense" or (c.attention == "auto" and x.shape[1] <= FEW_ATOMS)
@@ -494,7 +480,7 @@ class SimdPotential:
 
     @torch.no_grad()
     def __call__(self, positions_nm: Tensor) -> tuple[Tensor, Tensor]:
-        rows, width = len(positions_nm), _width(len(positions_nm))
+        rows, width = len(positions_nm), _width_for(len(positions_nm))
         x = _laid(positions_nm.double(), width)
         energy = torch.empty(len(x), self.config.n_members, width)
         gradient = torch.empty(len(x), self.n_atoms, 3, width)
@@ -511,7 +497,7 @@ class SimdPotential:
     def langevin(self, x: Tensor, v: Tensor, draw: Tensor, bath: Bath) -> tuple[Tensor, Tensor]:
         """Return positions nm and velocities nm/ps `(rows, n_atoms, 3)` after the steps that `draw` (rows, n_atoms,
         n_steps, 3) holds normal numbers for."""
-        rows, width, n_steps = len(x), _width(len(x)), draw.shape[2]
+        rows, width, n_steps = len(x), _width_for(len(x)), draw.shape[2]
         at, moving = _laid(x.double(), width), _laid(v.double(), width)
         drawn = _laid((bath.lost[..., None] * draw).transpose(1, 2).float(), width)
         # What the bath gives is drawn: no thermal speeds.
@@ -565,13 +551,13 @@ def simd_potential_of(network: EnergyNetwork, fabric: Fabric, made: EdgeWeights,
     if made.of_atom.dtype != torch.float32 or made.of_atom.device.type != "cpu" or not made.edges.dense:
         return None
     try:
-        _program(network.config, _width(rows))
+        _program(network.config, _width_for(rows))
     except (CompilerError, OSError):
         return None
     return SimdPotential(network, fabric, made, unit, zero)
 
 
-def _width(rows: int) -> int:
+def _width_for(rows: int) -> int:
     return _WIDTH if rows > _FEW else _FEW
 
 
@@ -625,12 +611,12 @@ class PainetPotential(Potential):
         self.network = EnergyNetwork(config)
         self.energy_offset_kj_mol = nn.Buffer(torch.zeros(()))
         self.energy_scale_kj_mol = nn.Buffer(torch.full((), 100.0))
-        self._known: tuple[Molecule, GradientFn] | None = None
+        self._made: tuple[Molecule, GradientFn] | None = None
         self._woven: Fabric | None = None
 
     def train(self, mode: bool = True) -> PainetPotential:
         """As any module; what was made of earlier weights is forgotten."""
-        self._known = None
+        self._made = None
         super().train(mode)
         return self
 
@@ -665,18 +651,18 @@ class PainetPotential(Potential):
     def gradient(self, positions_nm: Tensor, molecule: Molecule) -> GradientFn:
         """Return what computes the members' energies and their mean's gradient at frames like these: by SIMD where
         they run, else by torch."""
-        known = self._known
         # Above so many atoms pairs change from frame to frame.
-        if known is None or known[0] is not molecule or molecule.n_atoms > FEW_ATOMS or self.training:
-            fabric = self.fabric(molecule)
-            with torch.inference_mode(False), torch.no_grad():
-                made = self.network.prepare(fabric, positions_nm)
-            simd = None
-            if not self.training:
-                unit, zero = float(self.energy_scale_kj_mol), float(self.energy_offset_kj_mol)
-                simd = simd_potential_of(self.network, fabric, made, len(positions_nm), unit=unit, zero=zero)
-            self._known = known = molecule, simd or gradient_of(lambda x: self.members(x, fabric, made))
-        return known[1]
+        fixed = molecule.n_atoms <= FEW_ATOMS and not self.training
+        if fixed and self._made is not None and self._made[0] is molecule:
+            return self._made[1]
+        fabric, simd = self.fabric(molecule), None
+        with torch.inference_mode(False), torch.no_grad():
+            made = self.network.prepare(fabric, positions_nm)
+        if not self.training:
+            unit, zero = float(self.energy_scale_kj_mol), float(self.energy_offset_kj_mol)
+            simd = simd_potential_of(self.network, fabric, made, len(positions_nm), unit=unit, zero=zero)
+        self._made = molecule, simd or gradient_of(lambda x: self.members(x, fabric, made))
+        return self._made[1]
 
     def langevin(self, x: Tensor, v: Tensor, molecule: Molecule, masses: Tensor, thermal: Tensor, draw: Tensor, *,
                  timestep_ps: float | None = None) -> tuple[Tensor, Tensor]:  # fmt: skip

@@ -5,9 +5,11 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import combinations
 from pathlib import Path
 from typing import Any, ClassVar
 
+import networkx as nx
 import numpy as np
 import torch
 from torch import Tensor, nn
@@ -128,33 +130,21 @@ class Graph:
     degree: Tensor
 
 
+def bond_paths(molecule: Molecule, longest: int) -> dict[tuple[int, int], int]:
+    """Return how many bonds lie between atoms (i, j), i < j, where they are at most `longest`."""
+    paths = nx.all_pairs_shortest_path_length(nx.Graph(molecule.bonds.tolist()), cutoff=longest)
+    return {(i, j): n for i, ends in paths for j, n in ends.items() if i < j}
+
+
 def molecular_graph(molecule: Molecule, *, all_pairs: bool = False) -> Graph:
     """Return bonds and pairs two bonds apart (the edges of EGNO, Xu 2024), in time linear in the atoms; with
     `all_pairs` every other pair as well."""
-    n_atoms, device = molecule.n_atoms, molecule.elements.device
-    bonds = torch.cat([molecule.bonds, molecule.bonds.flip(1)])
-    bonds = bonds[bonds[:, 0].argsort(stable=True)]
-    second = bonds.new_zeros((0, 2))
-    if len(bonds):
-        n_bonds = torch.bincount(bonds[:, 0], minlength=n_atoms)
-        first = torch.cumsum(n_bonds, 0) - n_bonds
-        # Every bond (i, j) is followed by each bond (j, k).
-        reach = n_bonds[bonds[:, 1]]
-        start = torch.repeat_interleave(bonds[:, 0], reach)
-        step = torch.arange(int(reach.sum()), device=device) - torch.repeat_interleave(reach.cumsum(0) - reach, reach)
-        end = bonds[torch.repeat_interleave(first[bonds[:, 1]], reach) + step, 1]
-        second = torch.stack([start, end], 1)[start != end]
-    pairs = [bonds, second]
-    if all_pairs:
-        index = torch.arange(n_atoms, device=device)
-        full = torch.cartesian_prod(index, index)
-        pairs.append(full[full[:, 0] != full[:, 1]])
-    kinds = torch.cat([torch.full((len(p),), kind, device=device) for kind, p in enumerate(pairs)])
-    keys = torch.cat([p[:, 0] * n_atoms + p[:, 1] for p in pairs])
-    # A pair of several kinds counts as the closest: a three-membered ring's bonds are bonds.
-    unique, place = torch.unique(keys, return_inverse=True)
-    kind = torch.full((len(unique),), N_KINDS, device=device).scatter_reduce(0, place, kinds, "amin")
-    receiver, sender = unique // n_atoms, unique % n_atoms
+    n_atoms = molecule.n_atoms
+    pairs = dict.fromkeys(combinations(range(n_atoms), 2), NOT_BONDED) if all_pairs else {}
+    pairs |= {pair: BOND if n == 1 else SECOND_NEIGHBOUR for pair, n in bond_paths(molecule, 2).items()}
+    both = sorted([(i, j, k) for (i, j), k in pairs.items()] + [(j, i, k) for (i, j), k in pairs.items()])
+    edges = torch.tensor(both, dtype=torch.int64, device=molecule.elements.device).reshape(-1, 3)
+    receiver, sender, kind = edges.T.contiguous()
     return Graph(receiver, sender, kind, torch.bincount(receiver, minlength=n_atoms).clamp(min=1))
 
 

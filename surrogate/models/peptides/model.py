@@ -77,11 +77,11 @@ class StateJumps(nn.Module):
         nn.init.zeros_(self.logits.weight)
         nn.init.constant_(self.logits.bias, _RARELY)
 
-    def of_known(self, known: Tensor, states: Tensor, places: Tensor, counts: Tensor) -> Tensor:
-        """What all frames of a chunk have in common: `known` (b, r, slots), its `states` (b, r, MOST_TORSIONS),
+    def of_observed(self, observed: Tensor, states: Tensor, places: Tensor, counts: Tensor) -> Tensor:
+        """What all frames of a chunk have in common: `observed` (b, r, slots), its `states` (b, r, MOST_TORSIONS),
         `places` (r, 3) -> (b, r, width)."""
         beside = _beside(conditioning_states(states, counts))
-        h: Tensor = sum((of(x) for of, x in zip(self.of_given, beside, strict=True)), self.of_numbers(known.float()))
+        h: Tensor = sum((of(x) for of, x in zip(self.of_given, beside, strict=True)), self.of_numbers(observed.float()))
         return h + self.of_type(places[:, 0])
 
     def of_times_alone(
@@ -108,7 +108,7 @@ class StateJumps(nn.Module):
     def probabilities(self, torsion: int, h: Tensor, levels: Tensor, now: Tensor, conditioning: Tensor) -> Tensor:
         """Return the logits `(b, t, r, MOST_STATES)` of the new state of one torsion of each residue.
 
-        `h` (b, t, r, width) is what `of_known`, `of_times_alone` and `of_frames` add up to, `levels` what
+        `h` (b, t, r, width) is what `of_observed`, `of_times_alone` and `of_frames` add up to, `levels` what
         `of_times_alone` returns; `now` (b, t, r) the torsion's state in the frame before, `conditioning` (b, t, r, n)
         the `conditioning_states` of the new frame, of which torsions before this one count.
         """
@@ -128,22 +128,22 @@ class StateJumps(nn.Module):
         self.beside_change[1, :, 0, 0, 1] += after / _FAST
 
     def loss(
-        self, known: Tensor, states: Tensor, places: Tensor, counts: Tensor, times_ps: Tensor, apart_ps: Tensor,
+        self, observed: Tensor, states: Tensor, places: Tensor, counts: Tensor, times_ps: Tensor, apart_ps: Tensor,
         share: Tensor | None = None,
     ) -> Tensor:  # fmt: skip
         """Return the negative log-likelihood of what torsions did, per frame and torsion.
 
-        `known` (b, r, slots); `states` (b, 1 + t, r, MOST_TORSIONS), the given frame's first; `share` (b, r,
+        `observed` (b, r, slots); `states` (b, 1 + t, r, MOST_TORSIONS), the given frame's first; `share` (b, r,
         MOST_TORSIONS): what each torsion's change counts in a window, 1 where it is not given.
         """
-        with torch.autocast(known.device.type, enabled=False):
+        with torch.autocast(observed.device.type, enabled=False):
             before, new = states[:, :-1], states[:, 1:]
             earlier = torch.cat([before[:, :1], before[:, :-1]], dim=1)
             of_times, levels = self.of_times_alone(times_ps, apart_ps, places, counts)
             h = self.of_frames(conditioning_states(before, counts), conditioning_states(earlier, counts))
-            h = h + of_times[:, :, None] + self.of_known(known, states[:, 0], places, counts)[:, None]
+            h = h + of_times[:, :, None] + self.of_observed(observed, states[:, 0], places, counts)[:, None]
             conditioning = conditioning_states(new, counts)
-            total = known.new_zeros(())
+            total = observed.new_zeros(())
             for torsion in torch.nonzero((counts > 0).any(0))[:, 0].tolist():
                 has = counts[:, torsion] > 0
                 logits = self.probabilities(torsion, h, levels, before[..., torsion], conditioning)[:, :, has]
@@ -153,17 +153,17 @@ class StateJumps(nn.Module):
             return total / (times_ps.numel() * max(1, int((counts > 0).sum())))
 
     def draw(
-        self, known: Tensor, states: Tensor, places: Tensor, counts: Tensor, times_ps: Tensor, apart_ps: Tensor,
+        self, observed: Tensor, states: Tensor, places: Tensor, counts: Tensor, times_ps: Tensor, apart_ps: Tensor,
         uniform: Tensor,
     ) -> Tensor:  # fmt: skip
         """Return states `(b, t, r, MOST_TORSIONS)` of new frames, from the given frame's numbers and `states`
         (b, r, MOST_TORSIONS) and numbers `uniform` (b, t, r, MOST_TORSIONS) in [0, 1)."""
-        with torch.autocast(known.device.type, enabled=False):
+        with torch.autocast(observed.device.type, enabled=False):
             of_times, levels = self.of_times_alone(times_ps, apart_ps, places, counts)
-            common = self.of_known(known, states, places, counts)[:, None] + of_times[:, :, None]
+            common = self.of_observed(observed, states, places, counts)[:, None] + of_times[:, :, None]
             # A residue's torsion in each state, as `conditioning_states` has it.
-            ones = torch.eye(MOST_STATES, device=known.device) * (counts > 0)[..., None, None]
-            residues, most = torch.arange(len(counts), device=known.device), (counts - 1).clamp(min=0)
+            ones = torch.eye(MOST_STATES, device=observed.device) * (counts > 0)[..., None, None]
+            residues, most = torch.arange(len(counts), device=observed.device), (counts - 1).clamp(min=0)
             torsions = torch.nonzero((counts > 0).any(0))[:, 0].tolist()
             now, found = states[:, None], []
             before = conditioning = conditioning_states(now, counts)
@@ -296,20 +296,20 @@ class PeptideFlow(nn.Module):
         skip, out, scale_in = (flow.expand(v, o) for v in flow.preconditioning(tau))
         return skip * o + out * self._network(o * scale_in, tau, conditioning)
 
-    def conditioning(self, known: Tensor, times_ps: Tensor, places: Tensor, states: Tensor) -> Conditioning:
-        """Return what all evaluations of a chunk have in common, of the given frame `known` (b, r, slots), `times_ps`
+    def conditioning(self, observed: Tensor, times_ps: Tensor, places: Tensor, states: Tensor) -> Conditioning:
+        """Return what all evaluations of a chunk have in common, of the given frame `observed` (b, r, slots), `times_ps`
         (b, t), `places` (r, 3), and `states` (b, 1 + t, r, n) of the given frame and the others
         (`conditioning_states`)."""
         types = places[:, 0]
         of_states = self.of_states(states, types)
         of_type: Tensor = sum((table(places[:, k]) for k, table in enumerate(self.of_type)), torch.zeros(()))
-        angles = rotary_angles(times_ps.shape[1] + 1, self.config.width // self.config.n_heads).to(known.device)
-        place = torch.arange(len(types), device=known.device)
+        angles = rotary_angles(times_ps.shape[1] + 1, self.config.width // self.config.n_heads).to(observed.device)
+        place = torch.arange(len(types), device=observed.device)
         apart = (place[:, None] - place).clamp(-_FAR, _FAR) + _FAR
         return Conditioning(
             types,
             of_type,
-            self.of_known(known[:, None], types) + of_states[:, :1] + self.of_given,
+            self.of_known(observed[:, None], types) + of_states[:, :1] + self.of_given,
             self._of_times(times_ps)[:, :, None] + of_states[:, 1:],
             (angles.cos(), angles.sin()),
             [cast(PeptideLayer, layer).of_distance(apart).permute(2, 0, 1) for layer in self.layers],
@@ -426,15 +426,15 @@ class PeptideSlide(Propagator):
         found = (table[right - 1] * (1 - share) + table[right] * share).clamp(0.0, _MOST_CORRELATED)
         return torch.where((times_ps >= self.config.forgotten_ps)[..., None, None], 0.0, found)
 
-    def innovations(self, later: Tensor, known: Tensor, times_ps: Tensor, types: Tensor) -> Tensor:
-        """Numbers `(b, t, r, slots)` at `times_ps` (b, t) after `known` (b, r, slots) -> innovations."""
+    def innovations(self, later: Tensor, observed: Tensor, times_ps: Tensor, types: Tensor) -> Tensor:
+        """Numbers `(b, t, r, slots)` at `times_ps` (b, t) after `observed` (b, r, slots) -> innovations."""
         rho = self.correlation_at(times_ps, types)
-        return (later - rho * known[:, None]) / (1.0 - rho.square()).sqrt()
+        return (later - rho * observed[:, None]) / (1.0 - rho.square()).sqrt()
 
-    def from_innovations(self, y: Tensor, known: Tensor, times_ps: Tensor, types: Tensor) -> Tensor:
+    def from_innovations(self, y: Tensor, observed: Tensor, times_ps: Tensor, types: Tensor) -> Tensor:
         """The inverse of `innovations`."""
         rho = self.correlation_at(times_ps, types)
-        return rho * known[:, None] + (1.0 - rho.square()).sqrt() * y
+        return rho * observed[:, None] + (1.0 - rho.square()).sqrt() * y
 
     def noise_shape(self, n_atoms: int) -> tuple[int, ...]:
         # At least as many numbers as a frame has coordinates that vary.
@@ -447,36 +447,36 @@ class PeptideSlide(Propagator):
         if chain is None:
             raise InputError("this model knows peptides by residues; make molecules by its `featurise`.")
         types, filled = chain.places[:, 0], chain.code.filled
-        known, now = self.normalised(last_frames_nm[:, -1], chain)
+        observed, now = self.normalised(last_frames_nm[:, -1], chain)
         assert self.lag_ps is not None
-        ahead = self.lag_ps * torch.arange(1, self.n_new + 1, device=known.device)
-        times = ahead.expand(len(known), -1).float()
-        drawn = known.new_zeros(*noise.shape[:2], *filled.shape)
-        drawn[..., filled] = noise.flatten(2)[..., : int(filled.sum())].to(known)
+        ahead = self.lag_ps * torch.arange(1, self.n_new + 1, device=observed.device)
+        times = ahead.expand(len(observed), -1).float()
+        drawn = observed.new_zeros(*noise.shape[:2], *filled.shape)
+        drawn[..., filled] = noise.flatten(2)[..., : int(filled.sum())].to(observed)
         counts, apart = chain.stated.counts, times_apart(times, self.config.forgotten_ps)
         shape = (self.n_new, *counts.shape)
 
         def draw_states(rows: Tensor, attempt: int) -> Tensor:
             seeds = generators(noise[rows], STATES, attempt)
-            uniform = torch.stack([torch.rand(shape, generator=g) for g in seeds]).to(known)
-            return self.jumps.draw(known[rows], now[rows], chain.places, counts, times[rows], apart[rows], uniform)
+            uniform = torch.stack([torch.rand(shape, generator=g) for g in seeds]).to(observed)
+            return self.jumps.draw(observed[rows], now[rows], chain.places, counts, times[rows], apart[rows], uniform)
 
-        rows = torch.arange(len(known), device=known.device)
+        rows = torch.arange(len(observed), device=observed.device)
         states = draw_states(rows, 0)
         evaluations = 0.0
 
         def solve(rows: Tensor, drawn: Tensor) -> tuple[Tensor, Tensor, Tensor]:
             """Return frames, and in which rows some disobey their states and some overlap, all that could be done."""
             of_states = conditioning_states(torch.cat([now[rows, None], states[rows]], dim=1), counts)
-            conditioning = self.flow.conditioning(known[rows], times[rows], chain.places, of_states)
+            conditioning = self.flow.conditioning(observed[rows], times[rows], chain.places, of_states)
 
             def predict(o: Tensor, tau: Tensor) -> Tensor:
                 nonlocal evaluations
-                evaluations += len(rows) / len(known)
+                evaluations += len(rows) / len(observed)
                 return torch.where(filled, self.flow(o, tau, conditioning), 0.0)
 
             y = flow.SOLVERS[solver or self.solvers[0]](predict, drawn, solver_steps)
-            tokens = self._tokens(self.from_innovations(y, known[rows], times[rows], types), states[rows], chain)
+            tokens = self._tokens(self.from_innovations(y, observed[rows], times[rows], types), states[rows], chain)
             resolved = mended(tokens.flatten(0, 1), states[rows].flatten(0, 1), chain)
             frames, astray, crowded = (x.unflatten(0, tokens.shape[:2]) for x in resolved)
             return self._laid(frames, chain), astray.any(-1), crowded.any(-1)

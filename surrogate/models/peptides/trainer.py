@@ -52,13 +52,13 @@ _RIDGE, _MOST = 0.3, 3.0
 
 @dataclass(frozen=True, eq=False)
 class Phi:
-    """One phi of a peptide: its `residue`, frames well on its negative and on its positive side, as numbers `known` (n,
+    """One phi of a peptide: its `residue`, frames well on its negative and on its positive side, as numbers `observed` (n,
     n_residues, n_slots) and `states` (n, n_residues, MOST_TORSIONS) each, and how likely the positive is beside the
     other."""
 
     chain: chains.ChainFeatures
     residue: int
-    known: tuple[Tensor, ...]
+    observed: tuple[Tensor, ...]
     states: tuple[Tensor, ...]
     positive: float
 
@@ -97,8 +97,8 @@ def weighted_phis(model: PeptideSlide, subject: PeptideSubject) -> list[Phi]:
     for residue in chain.signed.tolist():
         sides = [_side(subject, residue, state) for state in (0, 1)]
         if types[residue + 1] != "PRO" and min(len(idx) for idx, _ in sides) >= _LEAST_FRAMES:
-            known, states = zip(*(subject.seen(model, idx) for idx, _ in sides), strict=True)
-            found.append(Phi(chain, residue, known, states, sides[1][1] / sides[0][1]))
+            observed, states = zip(*(subject.seen(model, idx) for idx, _ in sides), strict=True)
+            found.append(Phi(chain, residue, observed, states, sides[1][1] / sides[0][1]))
     return found
 
 
@@ -133,14 +133,14 @@ def _side(subject: PeptideSubject, residue: int, state: int) -> tuple[Tensor, fl
 def _log_probabilities(model: PeptideSlide, phi: Phi, state: int) -> Tensor:
     """Return the logarithm of how likely, in the mean over frames of one side, a phi is on the other `_TIMES_PS`
     later."""
-    known, now, chain = phi.known[state], phi.states[state], phi.chain
+    observed, now, chain = phi.observed[state], phi.states[state], phi.chain
     counts, before, found = chain.stated.counts, now[:, None], []
     conditioning = chains.conditioning_states(before, counts)
-    common = model.jumps.of_known(known, now, chain.places, counts)[:, None] + model.jumps.of_frames(
+    common = model.jumps.of_observed(observed, now, chain.places, counts)[:, None] + model.jumps.of_frames(
         conditioning, conditioning
     )
     for time_ps in _TIMES_PS:
-        times = torch.full((len(known), 1), time_ps, device=known.device)
+        times = torch.full((len(observed), 1), time_ps, device=observed.device)
         apart = times_apart(times, model.config.forgotten_ps)
         of_times, levels = model.jumps.of_times_alone(times, apart, chain.places, counts)
         logits = model.jumps.probabilities(0, common + of_times[:, :, None], levels, before[..., 0], conditioning)
@@ -247,9 +247,9 @@ def train_peptides(
         if which not in pools:
             pools[which] = StateWindows.of(subject, config)
         idx, times, share = pools[which].draw(_JUMPS_BATCH, generator)
-        known, _ = subject.seen(model, idx[:, 0])
+        observed, _ = subject.seen(model, idx[:, 0])
         states = subject.states(idx).to(device)
-        loss = state_loss(model, subject.chain, known, states, times.to(device), generator, share=share.to(device))
+        loss = state_loss(model, subject.chain, observed, states, times.to(device), generator, share=share.to(device))
         return loss, {"jumps": loss.detach()}
 
     @torch.no_grad()
@@ -421,15 +421,15 @@ def peptide_loss(
     frame is disturbed as in training. Returns the loss and its parts: of torsions' numbers, of stiff ones.
     """
     c, filled = model.config, chain.code.filled
-    known, later = numbers[:, 0], numbers[:, 1:]
+    observed, later = numbers[:, 0], numbers[:, 1:]
     if noisy:
-        known = disturbed(known, chain, c, generator)
-    target = model.innovations(later, known, times_ps, chain.places[:, 0])
+        observed = disturbed(observed, chain, c, generator)
+    target = model.innovations(later, observed, times_ps, chain.places[:, 0])
     draws = torch.randn(len(numbers), generator=generator) * c.tau_scale + c.tau_location
     tau = torch.sigmoid(draws).clamp(max=TAU_MAX).to(numbers.device)
     noise = torch.randn(target.shape, generator=generator).to(numbers.device) * filled
     conditioning = model.flow.conditioning(
-        known, times_ps, chain.places, chains.conditioning_states(states, chain.stated.counts)
+        observed, times_ps, chain.places, chains.conditioning_states(states, chain.stated.counts)
     )
     found = model.flow(flow.mixed(target, noise, tau), tau, conditioning)
     weight = flow.expand(flow.preconditioning(tau)[1].square().reciprocal(), target)
@@ -450,22 +450,24 @@ def by_kind(error: Tensor, chain: chains.ChainFeatures, config: PeptideConfig) -
 
 
 def state_loss(
-    model: PeptideSlide, chain: chains.ChainFeatures, known: Tensor, states: Tensor, times_ps: Tensor,
+    model: PeptideSlide, chain: chains.ChainFeatures, observed: Tensor, states: Tensor, times_ps: Tensor,
     generator: torch.Generator, *, noisy: bool = True, share: Tensor | None = None,
 ) -> Tensor:  # fmt: skip
-    """Return the negative log-likelihood of the changes of states: `known` (b, r, slots) the given frame's numbers,
+    """Return the negative log-likelihood of the changes of states: `observed` (b, r, slots) the given frame's numbers,
     `states` (b, 1 + t, r, MOST_TORSIONS), `times_ps` (b, t), `share` (b, r, MOST_TORSIONS) what each change counts,
     1 where it is not given; otherwise as `peptide_loss`."""
     if noisy:
-        known = disturbed(known, chain, model.config, generator)
+        observed = disturbed(observed, chain, model.config, generator)
     apart = times_apart(times_ps, model.config.forgotten_ps)
-    return model.jumps.loss(known, states, chain.places, chain.stated.counts, times_ps, apart, share)
+    return model.jumps.loss(observed, states, chain.places, chain.stated.counts, times_ps, apart, share)
 
 
-def disturbed(known: Tensor, chain: chains.ChainFeatures, config: PeptideConfig, generator: torch.Generator) -> Tensor:
+def disturbed(
+    observed: Tensor, chain: chains.ChainFeatures, config: PeptideConfig, generator: torch.Generator
+) -> Tensor:
     """Return the given frame's numbers `(b, r, slots)` with the noise that training adds."""
-    noise = torch.randn(known.shape, generator=generator).to(known.device)
-    return known + config.conditioning_noise * chain.code.filled * noise
+    noise = torch.randn(observed.shape, generator=generator).to(observed.device)
+    return observed + config.conditioning_noise * chain.code.filled * noise
 
 
 # Share of the longest trajectory that a window may span: its end is held out.

@@ -163,7 +163,7 @@ def test_the_second_torsion_sees_the_new_state_of_the_first_and_not_its_own() ->
     torch.nn.init.normal_(jumps.logits.weight)
     before = torch.zeros(1, 1, 1, MOST_TORSIONS, dtype=torch.long)
     places, time = torch.tensor([[0, 1, 1]]), torch.ones(1, 1)
-    common = jumps.of_known(torch.zeros(1, 1, 4), before[:, 0], places, counts)
+    common = jumps.of_observed(torch.zeros(1, 1, 4), before[:, 0], places, counts)
     of_times, levels = jumps.of_times_alone(time, time, places, counts)
     conditioning = conditioning_states(before, counts)
     h = jumps.of_frames(conditioning, conditioning) + common[:, None] + of_times[:, :, None]
@@ -204,7 +204,7 @@ def test_rates_of_two_residue_types_are_learned() -> None:
     up = states[:1, 0]
     for apart_ps in (1.0, 10.0):
         time = torch.tensor([[apart_ps]])
-        common = net.of_known(torch.zeros(1, 2, 6), up, places, counts)
+        common = net.of_observed(torch.zeros(1, 2, 6), up, places, counts)
         of_times, levels = net.of_times_alone(time, time, places, counts)
         conditioning = conditioning_states(up[:, None], counts)
         h = net.of_frames(conditioning, conditioning) + common[:, None] + of_times[:, :, None]
