@@ -211,8 +211,6 @@ class TrainingConfig:
     bf16: bool = True
     device: str = "cpu"
     validate_every_s: float = 60.0
-    # Compile stage two's network and the decoder; needs a C++ compiler on the machine.
-    compile: bool = False
     # Present every other window backwards: exact for positions of a system in equilibrium (microscopic
     # reversibility), and each rare event then shows how it begins and how it ends.
     time_reversal: bool = False
@@ -334,12 +332,8 @@ def window_frames(first: Tensor, length: int, generator: torch.Generator, *, tim
 def _stage_two(subject: Subject, config: TrainingConfig, stage: StageConfig) -> Stage:
     model, device, frames = subject.model, subject.device, subject.frames
     length, several = model.config.approximator.chunk_frames, len(subject.strides) > 1
-    starts = torch.from_numpy(frames.window_starts(length, validation=False))
-    wide = StrideSampler.of(frames, length, subject.strides)
+    own, others = (StrideSampler.of(frames, length, subject.strides, validation=held) for held in (False, True))
     model.autoencoder.requires_grad_(False)
-    if config.compile:
-        model.approximator.compile()
-        model.autoencoder.decode = torch.compile(model.autoencoder.decode)  # type: ignore[method-assign]
     subject.keep_latents()
 
     def loss_of(
@@ -350,21 +344,18 @@ def _stage_two(subject: Subject, config: TrainingConfig, stage: StageConfig) -> 
         return flow_loss(model, latents, len(subject.elements), tau, generator, lag)
 
     def loss_fn(generator: torch.Generator) -> tuple[Tensor, dict[str, Tensor]]:
-        stride = None
         if several:
-            first, stride = wide.draw(stage.batch, generator)
+            first, stride = own.draw(stage.batch, generator)
         else:
-            first = starts[torch.randint(len(starts), (stage.batch,), generator=generator)]
+            first, stride = own.starts[0][torch.randint(len(own.starts[0]), (stage.batch,), generator=generator)], None
         tau = draw_flow_times(model, stage.batch, generator).to(device)
         idx = window_frames(first, length, generator, time_reversal=config.time_reversal, stride=stride)
         return loss_of(idx, stride, tau, generator)
 
-    held_stride = None
     if several:
-        sampler = StrideSampler.of(frames, length, subject.strides, validation=True)
-        held, held_stride = sampler.draw(_HELD_WINDOWS, torch.Generator().manual_seed(0))
+        held, held_stride = others.draw(_HELD_WINDOWS, torch.Generator().manual_seed(0))
     else:
-        held = torch.from_numpy(frames.window_starts(length, validation=True))
+        held, held_stride = others.starts[0], None
         held = held[torch.linspace(0, len(held) - 1, min(_HELD_WINDOWS, len(held))).long()]
     held = window_frames(held, length, torch.Generator(), time_reversal=False, stride=held_stride)
     with_bf16 = stage.bf16 and bf16_pays(device.type)

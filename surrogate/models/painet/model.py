@@ -19,7 +19,7 @@ from surrogate.data import References, TrainingFrames
 from surrogate.models import architecture as arch
 from surrogate.models.architecture import ModelConfig
 from surrogate.models.propagator import Chunk, Molecule, Propagator
-from surrogate.models.weights import Weights, provenance_of, save_weights, training_domain
+from surrogate.models.weights import provenance_of, save_weights, training_domain
 from surrogate.training.loop import ProgressFn, Stage, StageConfig, train_stages
 from systems.errors import InputError
 from systems.units import GAS_CONSTANT_KJ_MOL_K
@@ -429,13 +429,10 @@ def train_painet(
     config: PainetTraining,
     *,
     model_class: type[Painet] = Painet,
-    start: Weights | None = None,
     resume: bool = False,
     progress: ProgressFn | None = None,
 ) -> Path:
     """Train on `frames`, which carry velocities, and write `out` (.safetensors) with a CSV of the curves beside it.
-
-    `start`: weights of the same configuration that the training begins from, with their scales.
 
     Raises InputError when the frames carry none or are too short, SimulationError when training diverges.
     """
@@ -449,10 +446,6 @@ def train_painet(
     structure = model.structure(model.featurise(frames.scene).to(device))
     windows = StateWindows(frames, model_config, device)
     model.set_scales(windows.velocity_scale_nm_ps, windows.position_scale_nm, windows.change_scale_nm_ps)
-    if start is not None:
-        if start.model.config != model_config:
-            raise InputError(f"{start.path} is of another configuration, {start.model.config}, than {model_config}.")
-        model.load_state_dict(start.model.state_dict())
     stage = StageConfig("forecast", config.batch, config.learning_rate, config.budget_s, config.steps,
                         seed=config.seed, bf16=config.bf16, validate_every_s=config.validate_every_s)  # fmt: skip
     domain = training_domain(frames, stride=model_config.frame_stride)
@@ -467,7 +460,7 @@ def train_painet(
     def write(spent_s: list[float]) -> None:
         settings = {"seed": config.seed, "noise": config.noise, "pushforward": config.pushforward,
                     "training_s": round(sum(spent_s), 1)}  # fmt: skip
-        save_weights(out, model, domain, provenance_of(frames.origin, settings, start))
+        save_weights(out, model, domain, provenance_of(frames.origin, settings))
 
     stages = [Stage(model, stage, loss_fn, validate)]
     train_stages(stages, out, write, device=device, resume=resume, progress=progress)

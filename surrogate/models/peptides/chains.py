@@ -56,8 +56,9 @@ class ChainLayout:
     @cached_property
     def tables(self) -> tuple[Tensor, Tensor, Tensor]:
         """`placed` (n, 4), `closing` (n,) and `primary` (n,) as tensors."""
-        rows = torch.tensor(self.placed, dtype=torch.long).reshape(-1, 4)
-        return rows, torch.tensor(self.closing, dtype=torch.bool), torch.tensor(self.primary, dtype=torch.long)
+        with torch.inference_mode(False):  # gradients may be taken through frames that follow from them
+            rows = torch.tensor(self.placed, dtype=torch.long).reshape(-1, 4)
+            return rows, torch.tensor(self.closing, dtype=torch.bool), torch.tensor(self.primary, dtype=torch.long)
 
     @cached_property
     def levels(self) -> list[list[int]]:
@@ -106,9 +107,13 @@ class ChainCode(nn.Module):
         self.deviation = fixed(torch.tensor(deviation, dtype=torch.float64))
         self.stiff, self.turning = fixed(stiff.nonzero()[:, 0]), fixed(turning.nonzero()[:, 0])
         self.stiff_at, self.turning_at = fixed(at[stiff]), fixed(at[turning])
-        filled = torch.zeros(self.n_residues * self.n_slots, dtype=torch.bool)
-        filled[torch.cat([self.stiff_at, self.turning_at, self.turning_at + 1])] = True
-        self.filled = nn.Buffer(filled.reshape(self.n_residues, self.n_slots), persistent=False)
+        places = torch.zeros(2, self.n_residues * self.n_slots, dtype=torch.bool)
+        places[0, self.stiff_at] = True
+        places[1, torch.cat([self.turning_at, self.turning_at + 1])] = True
+        # Places with stiff numbers and with those of torsions, `(n_residues, n_slots)`; and both.
+        filled_stiff, filled_turning = places.unflatten(1, (self.n_residues, self.n_slots))
+        self.filled_stiff, self.filled_turning = fixed(filled_stiff), fixed(filled_turning)
+        self.filled = nn.Buffer(filled_stiff | filled_turning, persistent=False)
 
     def encode(self, frames: Tensor) -> Tensor:
         """Frames `(..., n_atoms, 3)` nm -> tokens `(..., n_residues, n_slots)`, zero in empty places; float32."""
@@ -254,6 +259,12 @@ class ChainFeatures:
         """The residues `(n,)` whose phi has two sides."""
         return self.stated.residue[self.stated.slot == 0]
 
+    @property
+    def weighable(self) -> list[int]:
+        """Those of which it can be said how likely phi > 0 is: not before a proline, whose ring leaves them no room."""
+        types = (*self.code.layout.types, "")
+        return [residue for residue in self.signed.tolist() if types[residue + 1] != "PRO"]
+
     @cached_property
     def stated_at(self) -> Tensor:
         """Where among all numbers of a frame the cosine of each torsion that has states stands, `(n,)`; its sine is
@@ -268,6 +279,12 @@ class ChainFeatures:
         found = torch.full_like(self.code.filled, -1, dtype=torch.long).flatten()
         found[self.stated_at] = found[self.stated_at + 1] = self.stated.slot
         return found.reshape(self.code.filled.shape)
+
+    def state_of_numbers(self, states: Tensor) -> Tensor:
+        """`states` (..., n_residues, MOST_TORSIONS) of torsions -> that of each number's torsion, `(..., n_residues,
+        n_slots)`; 0 where that has none."""
+        at = self.state_at.expand(*states.shape[:-1], -1)
+        return torch.where(at < 0, 0, states.gather(-1, at.clamp(min=0)))
 
     def states(self, frames_nm: Tensor) -> Tensor:
         """Return the states of torsions `(..., n_residues, MOST_TORSIONS)` in frames `(..., n_atoms, 3)`."""

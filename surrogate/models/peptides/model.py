@@ -297,9 +297,9 @@ class PeptideFlow(nn.Module):
         return skip * o + out * self._network(o * scale_in, tau, conditioning)
 
     def conditioning(self, observed: Tensor, times_ps: Tensor, places: Tensor, states: Tensor) -> Conditioning:
-        """Return what all evaluations of a chunk have in common, of the given frame `observed` (b, r, slots), `times_ps`
-        (b, t), `places` (r, 3), and `states` (b, 1 + t, r, n) of the given frame and the others
-        (`conditioning_states`)."""
+        """Return what all evaluations of a chunk have in common, of the given frame's numbers `observed` (b, r, slots),
+        `times_ps` (b, t), `places` (r, 3), and the `conditioning_states` (b, 1 + t, r, n) of that frame and the
+        others."""
         types = places[:, 0]
         of_states = self.of_states(states, types)
         of_type: Tensor = sum((table(places[:, k]) for k, table in enumerate(self.of_type)), torch.zeros(()))
@@ -392,8 +392,7 @@ class PeptideSlide(Propagator):
     def middle(self, states: Tensor, chain: ChainFeatures) -> Tensor:
         """Return from where numbers count, `(..., n_residues, n_slots)`, in `states` (..., n_residues,
         MOST_TORSIONS)."""
-        at = chain.state_at.expand(*states.shape[:-1], -1)
-        own = torch.where(at < 0, 0, states.gather(-1, at.clamp(min=0)))
+        own = chain.state_of_numbers(states)
         mean = self.token_mean[chain.places[:, 0]]
         found = mean[:, 0].expand_as(own)
         for state in range(1, MOST_STATES):

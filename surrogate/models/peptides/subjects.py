@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import cast
@@ -141,7 +141,7 @@ class PeptideSubject:
     weights: FloatArray | None = None
 
     def in_equilibrium(self, positive_phi_kt: Mapping[str, float]) -> PeptideSubject:
-        """Return this subject with weights, or itself where its runs do not tell how likely its states are."""
+        """Return this subject with weights, or itself where its runs do not show how likely its states are."""
         ranges = self.frames.split.ranges(self.frames.starts, validation=False)
         kept = np.concatenate([np.arange(low, high) for low, high in ranges])
         states, shares = self._signs_of_phi(kept, positive_phi_kt)
@@ -159,13 +159,12 @@ class PeptideSubject:
         """Return the pattern of phi's signs of each frame `kept` (n,), as a number, and the population of each pattern.
 
         Residues are taken to be independent; those whose free energy is not given play no part, nor do those before a
-        proline, whose ring leaves them no room at phi > 0: how likely they are there is left to their own runs.
+        proline: how likely they are there is left to their own runs.
         """
-        types = (*self.chain.code.layout.types, "")
         states, shares = np.zeros(len(kept), dtype=np.int64), np.ones(1)
-        for residue in self.chain.signed.tolist():
+        for residue in self.chain.weighable:
             name = self.frames.scene.residue_names[residue]
-            if name in positive_phi_kt and types[residue + 1] != "PRO":
+            if name in positive_phi_kt:
                 states = states + len(shares) * self._states[kept, residue, 0]
                 probabilities = float(np.exp(-positive_phi_kt[name]))
                 shares = np.concatenate([shares, shares * probabilities])
@@ -174,21 +173,19 @@ class PeptideSubject:
     @cached_property
     def _states(self) -> npt.NDArray[np.int8]:
         """The states of torsions in each frame: `(n_frames, n_residues, MOST_TORSIONS)`."""
-        blocks = (
-            self._frames(k, min(k + _BLOCK, self.frames.n_frames)) for k in range(0, self.frames.n_frames, _BLOCK)
-        )
+        blocks = self._blocks(0, self.frames.n_frames)
         return torch.cat([self.chain.states(block).to(torch.int8).cpu() for block in blocks]).numpy()
 
-    def _frames(self, low: int, high: int) -> Tensor:
-        return torch.from_numpy(self.frames.positions_nm(np.arange(low, high))).to(self.chain.places.device)
+    def _blocks(self, low: int, high: int) -> Iterator[Tensor]:
+        for start in range(low, high, _BLOCK):
+            idx = np.arange(start, min(start + _BLOCK, high))
+            yield torch.from_numpy(self.frames.positions_nm(idx)).to(self.chain.places.device)
 
     def _torsions(self, low: int, high: int) -> FloatArray:
         """Return cosines and sines `(n, 2 n_torsions)` of frames."""
         at = self.chain.code.turning_at
-        found = []
-        for start in range(low, high, _BLOCK):
-            tokens = self.chain.code.encode(self._frames(start, min(start + _BLOCK, high)))
-            found.append(tokens.flatten(-2)[:, torch.cat([at, at + 1])].cpu())
+        both = torch.cat([at, at + 1])
+        found = [self.chain.code.encode(block).flatten(-2)[:, both].cpu() for block in self._blocks(low, high)]
         return torch.cat(found).double().numpy()
 
     def windows(
@@ -266,9 +263,7 @@ class PeptideSubject:
         return torch.from_numpy(first), torch.from_numpy(found)
 
     @cached_property
-    def _likely_from(
-        self,
-    ) -> tuple[FloatArray, list[IntArray], list[IntArray]]:
+    def _likely_from(self) -> tuple[FloatArray, list[IntArray], list[IntArray]]:
         """Return the sums of weights of groups of frames alike, each group's frames, and how many follow each in its
         run, the most first.
 
@@ -297,8 +292,8 @@ class PeptideSubject:
     def batch(self, n: int, config: PeptideConfig, generator: torch.Generator) -> tuple[Tensor, Tensor]:
         """Draw windows as a flow sees them: half of the batches of whole chunks, the others of fewer frames.
 
-        Returns frames and times as `windows` does. Some windows hold a change of a torsion's state: a flow that is told
-        of it may see as many as it needs.
+        Returns frames and times as `windows` does. Some windows hold a change of a torsion's state: a flow conditioned
+        on it may see as many as it needs.
         """
         later = config.chunk_frames
         if float(torch.rand(1, generator=generator)) >= _WHOLE_SHARE:
@@ -314,8 +309,8 @@ class PeptideSubject:
         Read forwards, crossings need no weights. Backwards, the frame that the run came from must be as likely as
         equilibrium has it among those on its own side.
         """
-        kinds, relative = self._crossings
-        if not kinds:
+        crossings, relative = self._crossings
+        if not crossings:
             return idx, times
         asked = (torch.rand(len(idx), generator=generator) < _CROSSING_SHARE) & (times[:, 0] < config.forgotten_ps)
         backwards = torch.rand(len(idx), generator=generator) < (0.0 if self.weights is None else 0.5)
@@ -324,8 +319,8 @@ class PeptideSubject:
             ahead = (times[row] / self.frames.lag_ps).round().long()
             span = int(ahead[-1])
             draws = torch.rand(3, _TRIES, generator=generator, dtype=torch.float64).numpy()
-            crossings = kinds[row % len(kinds)]
-            first = crossings[(draws[0] * len(crossings)).astype(np.int64)] - (draws[1] * span).astype(np.int64)
+            some = crossings[row % len(crossings)]
+            first = some[(draws[0] * len(some)).astype(np.int64)] - (draws[1] * span).astype(np.int64)
             which = np.searchsorted(ranges[:, 0], first, side="right") - 1
             low, high = ranges[which.clip(min=0)].T
             fits = (first >= low) & (first + span < high) & (which >= 0)
@@ -343,10 +338,10 @@ class PeptideSubject:
         there are any; and how likely each frame `(n_frames,)` is to be kept so that those of one pattern of phi are as
         in equilibrium, the likeliest (but for a few) always."""
         ranges = self.frames.split.ranges(self.frames.starts, validation=False)
-        kinds = []
+        crossings = []
         for which in self._rare_torsions():
             moved = (np.diff(self._states[:, which[0], which[1]], axis=0) != 0).any(axis=1)
-            kinds.append(np.concatenate([low + np.flatnonzero(moved[low : high - 1]) for low, high in ranges]))
+            crossings.append(np.concatenate([low + np.flatnonzero(moved[low : high - 1]) for low, high in ranges]))
         pattern = (self._states[:, :, 0] << np.arange(self._states.shape[1])).sum(axis=1)
         relative = np.ones(len(pattern))
         if self.weights is not None:
@@ -355,7 +350,7 @@ class PeptideSubject:
                 kept = self.weights[inside & (self.weights > 0)]
                 if len(kept):
                     relative[inside] = self.weights[inside] / np.quantile(kept, _LIKELIEST)
-        return [some for some in kinds if len(some)], relative
+        return [some for some in crossings if len(some)], relative
 
     def _rare_torsions(self) -> list[tuple[IntArray, IntArray]]:
         """Return residues and slots of phi, and those of heavy side chains: psi and rotors turn often enough."""

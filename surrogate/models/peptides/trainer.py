@@ -52,8 +52,8 @@ _RIDGE, _MOST = 0.3, 3.0
 
 @dataclass(frozen=True, eq=False)
 class Phi:
-    """One phi of a peptide: its `residue`, frames well on its negative and on its positive side, as numbers `observed` (n,
-    n_residues, n_slots) and `states` (n, n_residues, MOST_TORSIONS) each, and how likely the positive is beside the
+    """One phi of a peptide: its `residue`; frames well on its negative and on its positive side, `observed` (n,
+    n_residues, n_slots) and `states` (n, n_residues, MOST_TORSIONS) of each; and how likely `positive` is beside the
     other."""
 
     chain: chains.ChainFeatures
@@ -62,43 +62,35 @@ class Phi:
     states: tuple[Tensor, ...]
     positive: float
 
-    @property
-    def places(self) -> list[int]:
-        """The numbers of its residue's type, of the one's before and of the one's after."""
-        return [int(k) for k in self.chain.places[self.residue]]
-
 
 @torch.no_grad()
 def balance_entries(model: PeptideSlide, subjects: Sequence[PeptideSubject]) -> None:
     """Move the probabilities of entering phi > 0 of `model` to where detailed balance holds in the mean over
     `subjects`, whose weights say how likely phi > 0 is; those without weights play no part."""
-    n_types = len(model.token_mean)
     phis = [phi for subject in subjects for phi in weighted_phis(model, subject)]
     if not phis:
         return
-    conditioning = torch.zeros(len(phis), 3 * n_types, dtype=torch.float64)
-    for k, phi in enumerate(phis):
-        for which, place in enumerate(phi.places):
-            conditioning[k, which * n_types + place] = 1.0
-    held = conditioning.T @ conditioning + _RIDGE * torch.eye(3 * n_types, dtype=torch.float64)
+    # Of each phi the types of its residue, of the one before and of the one after.
+    types = torch.zeros(len(phis), 3, len(model.token_mean), dtype=torch.float64)
+    for of_phi, phi in zip(types, phis, strict=True):
+        of_phi[range(3), phi.chain.places[phi.residue].cpu()] = 1.0
+    types = types.flatten(1)
+    held = types.T @ types + _RIDGE * torch.eye(types.shape[1], dtype=torch.float64)
     for _ in range(_PASSES):
         lacking = torch.tensor([lacking_entries(model, phi) for phi in phis], dtype=torch.float64)
-        levels = torch.linalg.solve(held, conditioning.T @ lacking.clamp(-_MOST, _MOST))
+        levels = torch.linalg.solve(held, types.T @ lacking.clamp(-_MOST, _MOST))
         model.jumps.raise_entries(*levels.float().to(model.token_mean.device).chunk(3))
 
 
 def weighted_phis(model: PeptideSlide, subject: PeptideSubject) -> list[Phi]:
-    """Return each phi of a peptide of which frames show both sides and weights say how likely they are; before a
-    proline that is not known well enough."""
-    if subject.weights is None:
-        return []
-    chain, found = subject.chain, []
-    types = (*chain.code.layout.types, "")
-    for residue in chain.signed.tolist():
+    """Return each phi of a peptide of which frames show both sides and weights say how likely they are; none before a
+    proline."""
+    found: list[Phi] = []
+    for residue in subject.chain.weighable if subject.weights is not None else ():
         sides = [_side(subject, residue, state) for state in (0, 1)]
-        if types[residue + 1] != "PRO" and min(len(idx) for idx, _ in sides) >= _LEAST_FRAMES:
+        if min(len(idx) for idx, _ in sides) >= _LEAST_FRAMES:
             observed, states = zip(*(subject.seen(model, idx) for idx, _ in sides), strict=True)
-            found.append(Phi(chain, residue, observed, states, sides[1][1] / sides[0][1]))
+            found.append(Phi(subject.chain, residue, observed, states, sides[1][1] / sides[0][1]))
     return found
 
 
@@ -118,9 +110,9 @@ def _side(subject: PeptideSubject, residue: int, state: int) -> tuple[Tensor, fl
     total = float(weights.sum())
     if total == 0.0:
         return idx[:0], total
-    probabilities = weights if state == 0 else (weights > 0).double()
+    generator = torch.Generator().manual_seed(_SIDE_SEED)
     drawn = torch.multinomial(
-        probabilities, _SIDE_FRAMES, replacement=True, generator=torch.Generator().manual_seed(_SIDE_SEED)
+        weights if state == 0 else (weights > 0).double(), _SIDE_FRAMES, True, generator=generator
     )
     stated = subject.chain.stated.to(torch.device("cpu"))
     quad = stated.quads[(stated.residue == residue) & (stated.slot == 0)][0]
@@ -136,9 +128,8 @@ def _log_probabilities(model: PeptideSlide, phi: Phi, state: int) -> Tensor:
     observed, now, chain = phi.observed[state], phi.states[state], phi.chain
     counts, before, found = chain.stated.counts, now[:, None], []
     conditioning = chains.conditioning_states(before, counts)
-    common = model.jumps.of_observed(observed, now, chain.places, counts)[:, None] + model.jumps.of_frames(
-        conditioning, conditioning
-    )
+    common = model.jumps.of_observed(observed, now, chain.places, counts)[:, None]
+    common = common + model.jumps.of_frames(conditioning, conditioning)
     for time_ps in _TIMES_PS:
         times = torch.full((len(observed), 1), time_ps, device=observed.device)
         apart = times_apart(times, model.config.forgotten_ps)
@@ -316,13 +307,13 @@ def with_scale(config: PeptideConfig, sets: Sequence[TrainingFrames]) -> Peptide
 
 
 def _go_on_from(start: PeptideSlide, model: PeptideSlide) -> None:
-    """Give `model` the weights of `start`, and for the numbers that this knows its means, scales and correlations."""
+    """Give `model` the weights of `start`, and for the numbers that this has its means, scales and correlations."""
     own = {name: tensor.clone() for name, tensor in model.named_buffers()}
-    known = model.state_dict()
+    whole = model.state_dict()
     with torch.no_grad():
         for name, tensor in start.state_dict().items():
-            # Numbers that are new come after those that are known.
-            known[name][tuple(slice(n) for n in tensor.shape)] = tensor
+            # New numbers come after those of `start`.
+            whole[name][tuple(slice(n) for n in tensor.shape)] = tensor
     assert start.config.scale is not None and model.config.scale is not None
     for key in model.config.scale.slots.keys() - start.config.scale.slots.keys():
         places = _places(model.config, key)
@@ -334,10 +325,10 @@ def _places(config: PeptideConfig, key: str) -> tuple[slice, EllipsisType, slice
     """Return where a coordinate's numbers stand in `(n_types, ..., n_slots)`: of its residue's type, or, where it is a
     free end's, of all."""
     assert config.scale is not None
-    slot, kind = config.scale.slots[key], key.split()[0]
+    slot, bearer = config.scale.slots[key], key.split()[0]
     types = slice(None)
-    if kind not in chains.FREE_ENDS:
-        at = (*ENDS, *config.types).index(kind)
+    if bearer not in chains.FREE_ENDS:
+        at = (*ENDS, *config.types).index(bearer)
         types = slice(at, at + 1)
     return types, ..., slice(slot, slot + (1 if key in config.scale.mean else 2))
 
@@ -361,13 +352,12 @@ def normalise(model: PeptideSlide, subjects: Sequence[PeptideSubject], seed: int
         _count_middles(sums, subject)
         frames = torch.from_numpy(subject.frames.some_nm(_MEASURED_FRAMES // len(subjects) + _LEAST_MEASURED))
         tokens, states = subject.chain.code.encode(frames).double(), subject.chain.states(frames)
-        at = subject.chain.state_at
-        own = torch.where(at < 0, 0, states.gather(-1, at.clamp(min=0).expand(len(states), -1, -1)))
-        for r, kind in enumerate(subject.chain.places[:, 0].tolist()):
+        own = subject.chain.state_of_numbers(states)
+        for r, number in enumerate(subject.chain.places[:, 0].tolist()):
             for state in range(chains.MOST_STATES):
                 inside = (own[:, r] == state) & subject.chain.code.filled[r]
                 for power in range(3):
-                    sums[power, kind, state] += (tokens[:, r].pow(power) * inside).sum(0)
+                    sums[power, number, state] += (tokens[:, r].pow(power) * inside).sum(0)
     for _, _, place in of_ends:
         sums[..., place] = sums[..., place].sum(1, keepdim=True)
     mean = sums[1] / sums[0].clamp(min=1)
@@ -389,10 +379,10 @@ def normalise(model: PeptideSlide, subjects: Sequence[PeptideSubject], seed: int
                 continue
             first = torch.from_numpy(rng.choice(starts, size=min(_MEASURED_PAIRS // len(subjects) + 100, len(starts))))
             both = subject.seen(model, torch.stack([first, first + lag]))[0].double()
-            for r, kind in enumerate(subject.chain.places[:, 0].tolist()):
+            for r, number in enumerate(subject.chain.places[:, 0].tolist()):
                 x, y = both[0, :, r], both[1, :, r]
                 for what, value in enumerate((x * y, x * x, y * y)):
-                    products[what, kind, k] += value.sum(0)
+                    products[what, number, k] += value.sum(0)
     for _, _, place in of_ends:
         products[..., place] = products[..., place].sum(1, keepdim=True)
     for places in of_turning:
@@ -405,9 +395,9 @@ def _count_middles(sums: Tensor, subject: PeptideSubject) -> None:
     """Count one frame in the middle of each state, so that states never seen have a mean."""
     stated, slots = subject.chain.stated, subject.chain.state_at
     for residue, slot, middles in zip(stated.residue.tolist(), stated.slot.tolist(), stated.middles_deg, strict=True):
-        kind, at = int(subject.chain.places[residue, 0]), int(torch.nonzero(slots[residue] == slot)[0])
+        number, at = int(subject.chain.places[residue, 0]), int(torch.nonzero(slots[residue] == slot)[0])
         for place, value in ((at, middles.deg2rad().cos()), (at + 1, middles.deg2rad().sin())):
-            sums[:, kind, :, place] += torch.stack([value**power for power in range(3)]).double()
+            sums[:, number, :, place] += torch.stack([value**power for power in range(3)]).double()
 
 
 def peptide_loss(
@@ -428,9 +418,8 @@ def peptide_loss(
     draws = torch.randn(len(numbers), generator=generator) * c.tau_scale + c.tau_location
     tau = torch.sigmoid(draws).clamp(max=TAU_MAX).to(numbers.device)
     noise = torch.randn(target.shape, generator=generator).to(numbers.device) * filled
-    conditioning = model.flow.conditioning(
-        observed, times_ps, chain.places, chains.conditioning_states(states, chain.stated.counts)
-    )
+    of_states = chains.conditioning_states(states, chain.stated.counts)
+    conditioning = model.flow.conditioning(observed, times_ps, chain.places, of_states)
     found = model.flow(flow.mixed(target, noise, tau), tau, conditioning)
     weight = flow.expand(flow.preconditioning(tau)[1].square().reciprocal(), target)
     loss, turning, stiff = by_kind((found - target).square() * weight, chain, c)
@@ -440,12 +429,9 @@ def peptide_loss(
 def by_kind(error: Tensor, chain: chains.ChainFeatures, config: PeptideConfig) -> tuple[Tensor, Tensor, Tensor]:
     """Return the mean of squared errors `(b, t, r, slots)` in which torsions count more, that of torsions alone, and
     that of stiff numbers."""
-    filled = chain.code.filled
-    turning = torch.zeros_like(filled).flatten()
-    turning[chain.code.turning_at] = turning[chain.code.turning_at + 1] = True
-    turning = turning.reshape(filled.shape)
-    of_turning, of_stiff = (error[..., which].mean() for which in (turning, filled & ~turning))
-    share = config.turning_weight * turning.sum() / (config.turning_weight * turning.sum() + (filled & ~turning).sum())
+    turning, stiff = chain.code.filled_turning, chain.code.filled_stiff
+    of_turning, of_stiff = (error[..., which].mean() for which in (turning, stiff))
+    share = config.turning_weight * turning.sum() / (config.turning_weight * turning.sum() + stiff.sum())
     return share * of_turning + (1 - share) * of_stiff, of_turning, of_stiff
 
 
@@ -482,16 +468,15 @@ class PeptideTrainer(arch.Trainer):
 
     def choose(self, references: References, request: arch.TrainingRequest) -> tuple[arch.Choice, ...]:
         """See `Trainer.choose`."""
-        survey, known = references.survey, PeptideConfig()
-        found = []
-        going_on = request.start_from is not None
-        if not going_on and "shortest_ps" not in request.model and survey.lag_ps != known.shortest_ps:
+        survey, found = references.survey, list[arch.Choice]()
+        begins = request.start_from is None
+        if begins and "shortest_ps" not in request.model and survey.lag_ps != PeptideConfig.shortest_ps:
             found.append(arch.Choice("model.shortest_ps", survey.lag_ps, "the references' spacing of frames"))
-        if not going_on and "longest_ps" not in request.model:
+        if begins and "longest_ps" not in request.model:
             reach = int(_SPAN * min(survey.longest)) * survey.lag_ps
             if request.longest_lag_ps is not None:
                 found.append(arch.Choice("model.longest_ps", request.longest_lag_ps, "`longest_lag_ps`"))
-            elif reach < known.longest_ps:
+            elif reach < PeptideConfig.longest_ps:
                 found.append(arch.Choice("model.longest_ps", reach, "as far as every reference reaches"))
         if "time_reversal" not in request.training and survey.equilibrium:
             found.append(REVERSIBLE)
