@@ -156,8 +156,8 @@ class TrainingFrames:
 
     @property
     def origin(self) -> dict[str, Any]:
-        """How much reference these frames are, and of which files, as the record of a training has it."""
-        return {"reference_ns": self.total_ps * 1e-3, "sources": list(self.sources)}
+        """See `FrameSets.origin`."""
+        return FrameSets((self,)).origin
 
     def refuse_leaks(self) -> None:
         """Raise InputError when a run of RUN held-out frames is also trained on, as when a trajectory is given twice,
@@ -421,6 +421,9 @@ class StrideSampler:
 
     def draw(self, n: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
         """Return first frames `(n,)` and strides `(n,)`."""
+        if len(self.strides) == 1:
+            own = self.starts[0]
+            return own[torch.randint(len(own), (n,), generator=generator)], torch.full((n,), self.strides[0])
         which = torch.randint(len(self.strides), (n,), generator=generator)
         place = torch.rand(n, generator=generator, dtype=torch.float64)
         sizes = torch.tensor([len(starts) for starts in self.starts])
@@ -510,8 +513,7 @@ class References:
 
         Trajectories in `held` of a molecule that is trained on are its validation; molecules that appear in `held`
         alone are held out as systems. Raises InputError when save intervals or temperatures differ, when one molecule
-        comes in two atom orders, so that it would be trained on under one and held out under the other, and for leaks
-        of frames.
+        comes in two atom orders, and for leaks of frames.
         """
         grouped, also = _by_topology(self.paths), _by_topology(self.held)
         trained = [_read(files, also.pop(key, []), self.spool, canonical=True) for key, files in grouped.items()]

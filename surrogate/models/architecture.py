@@ -132,8 +132,7 @@ class TrainingRequest:
 
     def settings(self, kind: type[T], asked: dict[str, Any] | None = None) -> T:
         """Return the training's settings `kind`: the table `training` and what was `asked` for on the command line
-        (budget, steps, seed and device if None), which the table may not hold as well. Raises InputError for unknown
-        keys."""
+        (`RESOLVED` if None), which the table may not hold as well. Raises InputError for unknown keys."""
         asked = {name: getattr(self, name) for name in RESOLVED} if asked is None else asked
         if twice := sorted(asked.keys() & self.training):
             raise InputError(f"training.{twice[0]} is set on the command line, not in the configuration file.")
@@ -157,11 +156,8 @@ class Choice:
 
 @dataclass(frozen=True)
 class Settings:
-    """The configuration of a model and of its training, as they will be used: frozen dataclasses.
-
-    `resolved`: names of those of the training that the command line decides (budget, seed, ...), and of those of the
-    model that training finds; neither belongs into a configuration file.
-    """
+    """The configuration of a model and of its training, as they will be used: frozen dataclasses. `resolved`: names of
+    what the command line decides (budget, seed, ...) and training finds, which no configuration file holds."""
 
     model: Any
     training: Any

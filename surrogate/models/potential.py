@@ -273,9 +273,8 @@ def gradient_of(energy: EnergyFn) -> GradientFn:
 
 
 # Bonds to hydrogen that stay rigid while a molecule is integrated: CCMA (Eastman and Pande, J. Chem. Theory Comput. 6,
-# 434 (2010)), for many replicas at once. What a correction along one bond does to the others hangs on masses and on the
-# angles between bonds that share an atom, which hardly change. So one matrix, of the molecule at rest, turns deviations
-# of all bonds into corrections of all; a few rounds meet the tolerance.
+# 434 (2010)), for many replicas at once. One matrix, of the molecule at rest, turns deviations of all bonds into
+# corrections of all: it depends on masses and on angles between bonds that share an atom, which hardly change.
 
 
 class RigidBonds(NamedTuple):
@@ -306,28 +305,27 @@ class RigidBonds(NamedTuple):
     def place(self, free_nm: Tensor, before_nm: Tensor) -> Tensor:
         """Return positions `(rows, n_atoms, 3)` nearest to `free_nm` at which bonds have their lengths, moved along
         the bonds of `before_nm`. Rows that cannot be mended are returned as far as they came."""
-        along, x = self._along(before_nm), free_nm
-        for _ in range(ROUNDS):
-            off = 0.5 * (self.length2 - self._along(x).square().sum(-1))
-            if not bool((off.abs() > TOLERANCE * self.length2).any()):
-                break
-            x = self._moved(x, along, off)
-        return x
+
+        def off(bonds: Tensor) -> Tensor:
+            return 0.5 * (self.length2 - bonds.square().sum(-1))
+
+        return self._solved(free_nm, self._bonds(before_nm), off, TOLERANCE * self.length2)
 
     def project(self, v: Tensor, x_nm: Tensor) -> Tensor:
         """Return velocities `(rows, n_atoms, 3)` without those along bonds, at positions `x_nm`."""
-        along = self._along(x_nm)
-        for _ in range(ROUNDS):
-            off = -(along * self._along(v)).sum(-1)
-            if not bool((off.abs() > TOLERANCE).any()):
-                break
-            v = self._moved(v, along, off)
-        return v
+        along = self._bonds(x_nm)
+        return self._solved(v, along, lambda apart: -(along * apart).sum(-1), TOLERANCE)
 
-    def _along(self, x: Tensor) -> Tensor:
+    def _bonds(self, x: Tensor) -> Tensor:
         return x[:, self.first] - x[:, self.second]
 
-    def _moved(self, x: Tensor, along: Tensor, off: Tensor) -> Tensor:
-        step = (off @ self.inverse)[..., None] * along
-        x = x.index_add(1, self.first, step * self.per_mass[:, :1])
-        return x.index_add(1, self.second, -step * self.per_mass[:, 1:])
+    def _solved(self, x: Tensor, along: Tensor, off: Callable[[Tensor], Tensor], tolerance: Tensor | float) -> Tensor:
+        """Move ends of bonds `along` (rows, k, 3) until what is `off` by bonds is within the tolerance."""
+        for _ in range(ROUNDS):
+            wrong = off(self._bonds(x))
+            if not bool((wrong.abs() > tolerance).any()):
+                break
+            step = (wrong @ self.inverse)[..., None] * along
+            x = x.index_add(1, self.first, step * self.per_mass[:, :1])
+            x = x.index_add(1, self.second, -step * self.per_mass[:, 1:])
+        return x

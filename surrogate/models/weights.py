@@ -30,9 +30,8 @@ _LEAST_SIZE = 1_000_000
 @dataclass(frozen=True)
 class TrainingDomain:
     """The training domain of weights. `scene` is the template: atom k of the model is its atom k, and canonical
-    frames are superposed on its positions. `conditions` are those of the reference (force field, temperature_k, ...);
-    `geometry` is what its frames say of valid ones (systems.chemistry.validity.Geometry as a dictionary), `limits` how
-    far they go beyond that (systems.chemistry.validity.Limits; None where there are none).
+    frames are superposed on its positions. `conditions`: of the reference (force field, temperature_k, ...);
+    `geometry` and `limits` of its frames, as dictionaries (systems.chemistry.validity.Geometry and Limits).
 
     `lag_ps`: between frames, the shortest where the model takes a lag; `jumps` are then rows (lag, least and greatest
     jump) that stand for those of `limits` at each lag. `further`: the domains of other molecules trained on.

@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -23,9 +23,6 @@ from systems.errors import InputError, SimulationError, first_line
 from systems.files.schema import built, parsed
 from systems.files.whole_file import create_whole
 from systems.interrupts import stop_if_asked
-
-if TYPE_CHECKING:
-    from lightning_fabric import Fabric
 
 # Muon: momentum of matrices, made orthogonal before it is a step (Jordan et al., kellerjordan.github.io/posts/muon).
 # Potentials learn more by it in the same time (docs/studies/quantum/optimisers.py). torch has one of its own from 2.9
@@ -183,8 +180,6 @@ def load_tensors(path: Path, kind: str) -> tuple[dict[str, Any], dict[str, Tenso
 
 # One optimisation loop for every stage: budget in time or steps, warm-up and cosine, EMA, clipping, exact resume.
 
-# Seeds of one training's processes lie further apart than those of its stages.
-SEEDS_APART = 1_000_003
 # Matrices with fewer rows or columns are no business of Muon's.
 LEAST_MATRIX = 8
 
@@ -294,22 +289,19 @@ def run_stage(stage: Stage, place: StagePlace, *, progress: ProgressFn | None = 
               on_save: Callable[[float], None] | None = None) -> float:  # fmt: skip
     """Train a stage's module in place and leave it holding its EMA weights; return the seconds of training spent.
 
-    Each validation logs a CSV row, saves the resume state and calls `on_save(spent_s)` with EMA weights in. Of several
-    processes (training.devices) each draws its own batches, and the first alone validates and writes. Raises
+    Each validation logs a CSV row, saves the resume state and calls `on_save(spent_s)` with EMA weights in. Raises
     SimulationError when the loss stops being finite; the last saved state stays.
     """
     devices.keep_freed_memory()
     module, config, device = stage.module, stage.config, place.device
-    fabric = devices.open_fabric(device.type, config.bf16 and devices.bf16_pays(device.type))
+    bf16 = config.bf16 and devices.bf16_pays(device.type)
     optimisers = optimisers_of(module, config)
     rates = [[group["lr"] for group in optimiser.param_groups] for optimiser in optimisers]
     ema = Ema(module, config.ema_decay)
-    generator = torch.Generator().manual_seed(config.seed + SEEDS_APART * fabric.global_rank)
+    generator = torch.Generator().manual_seed(config.seed)
     step, spent_s = 0, 0.0
     if place.resume and place.state.exists():
-        step, spent_s = load_state(
-            place.state, module, ema, optimisers, generator, config, process=(fabric.global_rank, fabric.world_size)
-        )
+        step, spent_s = load_state(place.state, module, ema, optimisers, generator, config)
     last = time.monotonic()
     next_validation = spent_s + config.validate_every_s
     sums: dict[str, Tensor] = {}
@@ -320,13 +312,12 @@ def run_stage(stage: Stage, place: StagePlace, *, progress: ProgressFn | None = 
         for optimiser, full in zip(optimisers, rates, strict=True):
             for group, rate in zip(optimiser.param_groups, full, strict=True):
                 group["lr"] = rate * factor
-        with fabric.autocast():
+        with torch.autocast(device.type, dtype=torch.bfloat16, enabled=bf16):
             loss, terms = stage.loss(generator)
         module.zero_grad(set_to_none=True)
         loss.backward()
         now = time.monotonic()
-        # The first process's clock decides for all when to validate and to end.
-        spent_s, last = devices.average_gradients(fabric, module, spent_s + now - last), now
+        spent_s, last = spent_s + now - last, now
         norm = nn.utils.clip_grad_norm_(module.parameters(), config.clip_norm)
         if not torch.isfinite(norm):
             raise SimulationError(
@@ -342,11 +333,7 @@ def run_stage(stage: Stage, place: StagePlace, *, progress: ProgressFn | None = 
         step += 1
         ended = config.share_done(step, spent_s) >= 1.0
         if spent_s >= next_validation or ended:
-            generators = _all_generators(fabric, generator, device)
             next_validation = spent_s + config.validate_every_s
-            if not fabric.is_global_zero:
-                sums, n_summed = {}, 0
-                continue
             with ema.swapped(module):
                 metrics = {f"train_{k}": float(v) / n_summed for k, v in sums.items()} | stage.validate()
                 if on_save is not None:
@@ -354,7 +341,7 @@ def run_stage(stage: Stage, place: StagePlace, *, progress: ProgressFn | None = 
             sums, n_summed = {}, 0
             append_row(place.log, {"stage": config.name, "step": step, "spent_s": round(spent_s, 1),
                                   "learning_rate": config.learning_rate * factor, **metrics})  # fmt: skip
-            save_state(place.state, module, ema, optimisers, generators, step, spent_s, config)
+            save_state(place.state, module, ema, optimisers, generator, step, spent_s, config)
             if progress is not None:
                 progress(config.name, config.share_done(step, spent_s), metrics)
             # Validation is not training: it is left out of the budget.
@@ -379,15 +366,14 @@ def train_stages(
 
     The next stage is asked for when one has ended: a generator may prepare it from what that has learned, and do what
     is left to do after the last. `write(spent_s)` writes the weights, given the seconds of training of each stage so
-    far; of several processes the first alone calls it. Raises SimulationError when a loss stops being finite.
+    far. Raises SimulationError when a loss stops being finite.
     """
     log, spent_s = out.with_suffix(".csv"), list[float]()
     own = re.compile(re.escape(out.stem) + r"\.[^.]+\.train\.safetensors")
 
     def forget(*more: Path) -> None:
-        if devices.is_first_process():
-            for path in (*more, *(path for path in out.parent.iterdir() if own.fullmatch(path.name))):
-                path.unlink(missing_ok=True)
+        for path in (*more, *(path for path in out.parent.iterdir() if own.fullmatch(path.name))):
+            path.unlink(missing_ok=True)
 
     if not resume:
         forget(log)
@@ -398,10 +384,8 @@ def train_stages(
 
         place = StagePlace(out.with_name(f"{out.stem}.{stage.config.name}.train.safetensors"), log, device, resume)
         spent_s.append(run_stage(stage, place, progress=progress, on_save=save if stage.saves else None))
-    if devices.is_first_process():
-        write(spent_s)
+    write(spent_s)
     forget()
-    devices.wait_for_all()
 
 
 def optimisers_of(module: nn.Module, config: StageConfig) -> list[torch.optim.Optimizer]:
@@ -424,16 +408,6 @@ def optimisers_of(module: nn.Module, config: StageConfig) -> list[torch.optim.Op
     return [adam, Muon(matrices, config.matrix_rate, config.weight_decay)]
 
 
-def _all_generators(fabric: Fabric, generator: torch.Generator, device: torch.device) -> Tensor:
-    """Return the states of all processes' generators: `(n,)` of a single one, else `(processes, n)`."""
-    state = generator.get_state()
-    if fabric.world_size == 1:
-        return state
-    gathered = fabric.all_gather(state.to(device))
-    assert isinstance(gathered, Tensor)
-    return gathered.cpu()
-
-
 @dataclass(frozen=True)
 class StateHeader:
     """What a training state says of itself."""
@@ -446,26 +420,22 @@ class StateHeader:
     matrix_rate: float | None = None
 
 
-def save_state(path: Path, module: nn.Module, ema: Ema, optimisers: list[torch.optim.Optimizer], generators: Tensor,
-               step: int, spent_s: float, config: StageConfig) -> None:  # fmt: skip
+def save_state(path: Path, module: nn.Module, ema: Ema, optimisers: list[torch.optim.Optimizer],
+               generator: torch.Generator, step: int, spent_s: float, config: StageConfig) -> None:  # fmt: skip
     """Write the training state whole or not at all."""
     tensors = {f"model.{k}": v for k, v in module.state_dict().items()}
     tensors |= {f"ema.{k}": v for k, v in ema.shadow.items()}
     for number, optimiser in enumerate(optimisers):
         for index, state in optimiser.state_dict()["state"].items():
             tensors |= {f"optimiser{number or ''}.{index}.{k}": v for k, v in state.items()}
-    tensors["generator"] = generators
+    tensors["generator"] = generator.get_state()
     header = StateHeader(step, spent_s, config.name, config.seed, config.batch, config.matrix_rate)
     save_tensors(path, "surromd_training", asdict(header), tensors)
 
 
 def load_state(path: Path, module: nn.Module, ema: Ema, optimisers: list[torch.optim.Optimizer],
-               generator: torch.Generator, config: StageConfig, *, process: tuple[int, int] = (0, 1)
-               ) -> tuple[int, float]:  # fmt: skip
-    """Put a saved state back; return (step, spent_s). `process`: this one's number and that of all.
-
-    Raises InputError when the state is damaged, of another run or of another number of processes.
-    """
+               generator: torch.Generator, config: StageConfig) -> tuple[int, float]:  # fmt: skip
+    """Put a saved state back; return (step, spent_s). Raises InputError when it is damaged or of another run."""
     record, tensors = load_tensors(path, "surromd_training")
     header = built(StateHeader, record)
     for key, expected in (("stage", config.name), ("seed", config.seed), ("batch", config.batch),
@@ -488,8 +458,5 @@ def load_state(path: Path, module: nn.Module, ema: Ema, optimisers: list[torch.o
             index, name = key.split(".", 1)
             state.setdefault(int(index), {})[name] = tensor
         optimiser.load_state_dict({"state": state, "param_groups": optimiser.state_dict()["param_groups"]})
-    states = torch.atleast_2d(tensors["generator"])
-    if len(states) != process[1]:
-        raise InputError(f"training state {path} is of {len(states)} processes, this run has {process[1]}.")
-    generator.set_state(states[process[0]])
+    generator.set_state(tensors["generator"])
     return header.step, header.spent_s

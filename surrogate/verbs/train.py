@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, nullcontext
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -69,7 +69,7 @@ def train(references: Trajectories, out: PathLike, options: TrainOptions) -> Pat
 
     With `level='gfn2-xtb'` it learns one molecule, named as by `reference`, from that level's energies and forces:
     painet as a potential, which asks about the states that it is least sure of. The samples stay beside the weights
-    (NAME.samples.safetensors), and the error of forces against evaluations (NAME.rounds.csv).
+    (NAME.samples.safetensors).
 
     Architecture and settings that are not given are chosen to suit the references, and each choice is said with its
     reason (`explain_training` returns them all); one molecule at one spacing of frames gets lam-slide as it is.
@@ -81,8 +81,7 @@ def train(references: Trajectories, out: PathLike, options: TrainOptions) -> Pat
     file) whose second stage is trained further, with their configuration. `validation`: trajectories that the curves
     are measured on; without any it is the last twentieth of each; molecules that are in `validation` alone are held out
     whole. A stretch of motion that would be both trained on and validated on is refused. `longest_lag_ps`: every
-    spacing of frames from that of the references to this one is learned. `device`: 'auto', 'cpu' or 'cuda'; several
-    devices by torchrun (surrogate.training.devices).
+    spacing of frames from that of the references to this one is learned. `device`: 'auto', 'cpu' or 'cuda'.
 
     Beside `out`, a CSV holds the training curves and, until done, files the state that `resume` goes on from; at the
     end the curves are drawn (.svg), and a short rollout that is checked frame by frame says whether the weights are
@@ -106,19 +105,20 @@ def train(references: Trajectories, out: PathLike, options: TrainOptions) -> Pat
             written = learn_molecule(references, asked, options, _shown(bar))
         _conclude(written, fitted=False, quiet=options.quiet)
         return written
-    from surrogate.training.devices import choose_device, is_first_process
+    from surrogate.training.devices import choose_device
 
     plan = _plan(references, options.validation, replace(asked, device=choose_device(options.device)))
-    first, quiet = is_first_process(), options.quiet
     prepared = plan.trainer.prepare(plan.references, plan.request)
-    if first and not quiet:
+    if not options.quiet:
         for line in plan.lines():
             tell(out.name, line)
-    lock = OutputLock(out) if first else nullcontext()
-    with lock, progress_bar(f"training {prepared.scene}", quiet=quiet or not first) as bar, _said_when_stopped(out):
+    with (
+        OutputLock(out),
+        progress_bar(f"training {prepared.scene}", quiet=options.quiet) as bar,
+        _said_when_stopped(out),
+    ):
         written = prepared.start(_shown(bar))
-    if first:
-        _conclude(written, fitted=plan.trainer.fitted, quiet=quiet)
+    _conclude(written, fitted=plan.trainer.fitted, quiet=options.quiet)
     return written
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
@@ -257,10 +256,9 @@ class Approximator(nn.Module):
     ) -> Tensor:
         """Return the predicted data `(b, T, L, dim)`.
 
-        `o` (b, T, L, dim) noisy latents, `tau` (b,), `conditioning` (b, n_conditioning, L, dim) clean latents of the
-        first frames. The first frames of `o` carry no information: they are replaced by the clean ones. With
-        `clean_conditioning` they come back as they are, and `memory` is what `remember` said of them, so that the
-        evaluations of one chunk compute it once. `lag` (b, width): the embedded lag, for a network that takes it.
+        `o` (b, T, L, dim) noisy latents, of which the first frames are replaced by `conditioning` (b, n_conditioning,
+        L, dim), clean ones; `tau` (b,). With `clean_conditioning` these come back as they are, and `memory` is what
+        `remember` returns, once a chunk. `lag` (b, width): the embedded lag, for a network that takes it.
         """
         c = self.config
         time = self.embed_time(tau) if lag is None else self.embed_time(tau) + lag
@@ -336,8 +334,7 @@ class Approximator(nn.Module):
 class LamSlide(Propagator):
     """Encoder, approximator and decoder (section 3), behind the contract of `surrogate.models.propagator`.
 
-    Latents are used as (z - mean) / scale with a mean per latent component and one common scale, both measured on the
-    training frames: LayerNorm bounds their power but leaves constant offsets that carry no information.
+    Latents are used as (z - mean) / scale with a mean per component and one common scale of the training frames.
     """
 
     arch: ClassVar[str] = "lam-slide"
@@ -352,8 +349,8 @@ class LamSlide(Propagator):
         n_latents, latent_dim = config.autoencoder.n_latents, config.autoencoder.latent_dim
         self.autoencoder = Autoencoder(config.autoencoder)
         self.approximator = Approximator(config.approximator, n_latents, latent_dim)
-        # Spacing of the frames that `next_chunk` returns: the shortest of the range, until `at_lag` sets another.
-        self.lag_ps = config.approximator.lag_range_ps[0] if config.approximator.lag_range_ps else None
+        self.lag_range_ps = config.approximator.lag_range_ps
+        self.lag_ps = self.lag_range_ps[0] if self.lag_range_ps else None
         self.latent_mean = nn.Buffer(torch.zeros(n_latents, latent_dim))
         self.latent_scale = nn.Buffer(torch.ones(()))
 
@@ -364,15 +361,6 @@ class LamSlide(Propagator):
     def identifiers(self, n_atoms: int) -> Tensor:
         """The canonical assignment `(n_atoms,)`: identifier k for the template's atom k."""
         return torch.arange(n_atoms, device=self.latent_mean.device)
-
-    def at_lag(self, lag_ps: float) -> LamSlide:
-        """Return this model, its weights shared, with frames `lag_ps` apart. Raises InputError outside its range."""
-        known = self.config.approximator.lag_range_ps
-        if known is None or not known[0] * (1 - 1e-6) <= lag_ps <= known[1] * (1 + 1e-6):
-            raise InputError(f"a lag of {lag_ps:g} ps is none that this model was trained for.")
-        model = copy.copy(self)
-        model.lag_ps = lag_ps
-        return model
 
     def embedded_lag(self, lag_ps: Tensor | None, rows: int) -> Tensor | None:
         """Return the lags `(rows,)` (the model's own where None) as the latent flow takes them, `(rows, width)`; None

@@ -87,9 +87,8 @@ def flow_loss(
     on the predicted frames (with `loss_on_given` on all), plus decoded position and distance. `lag`: see
     `LamSlide.embedded_lag`.
 
-    With preconditioning the error is divided by c_out^2, so that every flow time asks for the same relative precision;
-    without it the weight is one, as in the paper. The decoded terms compare with the decoded clean latents, so that the
-    decoder's own error is not charged to the approximator.
+    With preconditioning the error is divided by c_out^2, so that every flow time asks for the same relative precision.
+    Decoded terms compare with the decoded clean latents: the decoder's own error is none of the approximator's.
     """
     c = model.config.approximator
     known = latents[:, : c.n_conditioning]
@@ -331,32 +330,29 @@ def window_frames(first: Tensor, length: int, generator: torch.Generator, *, tim
 
 def _stage_two(subject: Subject, config: TrainingConfig, stage: StageConfig) -> Stage:
     model, device, frames = subject.model, subject.device, subject.frames
-    length, several = model.config.approximator.chunk_frames, len(subject.strides) > 1
+    length = model.config.approximator.chunk_frames
     own, others = (StrideSampler.of(frames, length, subject.strides, validation=held) for held in (False, True))
     model.autoencoder.requires_grad_(False)
     subject.keep_latents()
 
     def loss_of(
-        idx: Tensor, stride: Tensor | None, tau: Tensor, generator: torch.Generator
+        idx: Tensor, stride: Tensor, tau: Tensor, generator: torch.Generator
     ) -> tuple[Tensor, dict[str, Tensor]]:
         latents = subject.windows(idx, generator)
-        lag = model.embedded_lag(None if stride is None else (stride * frames.lag_ps).to(device), len(idx))
+        lag = model.embedded_lag((stride * frames.lag_ps).to(device), len(idx))
         return flow_loss(model, latents, len(subject.elements), tau, generator, lag)
 
     def loss_fn(generator: torch.Generator) -> tuple[Tensor, dict[str, Tensor]]:
-        if several:
-            first, stride = own.draw(stage.batch, generator)
-        else:
-            first, stride = own.starts[0][torch.randint(len(own.starts[0]), (stage.batch,), generator=generator)], None
+        first, stride = own.draw(stage.batch, generator)
         tau = draw_flow_times(model, stage.batch, generator).to(device)
         idx = window_frames(first, length, generator, time_reversal=config.time_reversal, stride=stride)
         return loss_of(idx, stride, tau, generator)
 
-    if several:
-        held, held_stride = others.draw(_HELD_WINDOWS, torch.Generator().manual_seed(0))
-    else:
-        held, held_stride = others.starts[0], None
-        held = held[torch.linspace(0, len(held) - 1, min(_HELD_WINDOWS, len(held))).long()]
+    held, held_stride = others.draw(_HELD_WINDOWS, torch.Generator().manual_seed(0))
+    if len(subject.strides) == 1:
+        every = others.starts[0]
+        held = every[torch.linspace(0, len(every) - 1, min(_HELD_WINDOWS, len(every))).long()]
+        held_stride = torch.ones_like(held)
     held = window_frames(held, length, torch.Generator(), time_reversal=False, stride=held_stride)
     with_bf16 = stage.bf16 and bf16_pays(device.type)
 

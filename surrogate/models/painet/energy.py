@@ -2,12 +2,9 @@
 
 Embeddings start from types of atoms in their bonded surroundings. Each latent step looks at an atom's neighbourhood
 (sums of functions of distance and direction, and the invariants of these), then takes a step of the paper's descent
-(`EnergyAttention`), in which positions are carried along: the mean of all atoms' positions under positive weights that
-depend on embeddings and types is a vector that knows the whole molecule, at a cost linear in its atoms.
-
-The energy is read from the last embeddings, from a table of pair energies, and from the latent energy that attention
-descends, sum_ij rho_ij(|q_i - q_j|^2) with rho = a s - b s^2 (the paper's equation of E(H), and "Particle-type Adaptive
-Mapping").
+(`EnergyAttention`), in which positions are carried along: their mean under positive weights that depend on embeddings
+and types is a vector that knows the whole molecule, at a cost linear in its atoms. The energy is read from the last
+embeddings, from a table of pair energies, and from the latent energy that attention descends (the paper's E(H)).
 """
 
 from __future__ import annotations
@@ -40,11 +37,10 @@ SIZES = ("width", "n_steps", "n_radial", "n_scalars", "n_vectors", "n_tensors", 
 class PotentialConfig(IntegratorConfig):
     """Size of the network, beside the settings of the MD on it.
 
-    `n_steps` latent steps, each a look at the neighbourhood and, between them, energy-descent attention over all atoms.
-    An atom sees its neighbours by `n_scalars`, `n_vectors` and `n_tensors` sums of products of `n_radial` functions of
-    the distance. `n_members`: read-outs that learn from different samples; their mean is the potential, their spread
-    says where it is unsure. `attention`: 'linear' (factored over types), 'dense' (the same numbers) or 'auto'.
-    """
+    `n_steps` latent steps, each a look at the neighbourhood and energy-descent attention over all atoms. An atom sees
+    its neighbours by `n_scalars`, `n_vectors` and `n_tensors` sums of products of `n_radial` functions of the distance.
+    `n_members`: read-outs that learn from different samples; their mean is the potential, their spread says where it is
+    unsure. `attention`: 'linear' (factored over types), 'dense' (the same numbers) or 'auto'."""
 
     width: int = 64
     n_steps: int = 2
@@ -175,11 +171,9 @@ def _all_pairs(n_atoms: int) -> dict[tuple[int, int], int]:
 def measure_edges(
     positions_nm: Tensor, edges: Edges, n_radial: int, cutoff_nm: float, dtype: torch.dtype
 ) -> EdgeGeometry:
-    """Return distances, directions and radial functions of frames `(n_atoms, rows, 3)` nm, in `dtype`.
-
-    Radial functions are bumps (1 - (u - k)^2 / HALF_WIDTH^2)^3, zero outside, with u = log d in units of their spacing;
-    without exponentials, whose tails would be denormal numbers. Distances are softened by 0.1 pm: finite at zero.
-    """
+    """Return distances, directions and radial functions of frames `(n_atoms, rows, 3)` nm, in `dtype`: bumps
+    (1 - (u - k)^2 / HALF_WIDTH^2)^3, zero outside, with u = log d in units of their spacing (exponentials would have
+    denormal tails). Distances are softened by 0.1 pm: finite at zero."""
     apart = edges.apart_nm(positions_nm).to(dtype)
     # An atom is to itself as one far beyond the cutoff.
     alone = torch.where(edges.receiver == edges.sender, _FAR_NM2, _SOFTENING_NM2).to(dtype)
@@ -385,11 +379,9 @@ class EnergyNetwork(nn.Module):
 
 
 def latent_energy(q: Tensor, phi: Tensor, psi: Tensor, fabric: Fabric) -> Tensor:
-    """Return sum_ij rho_ij(|q_i - q_j|^2) / n^2 by head, `(rows, n_heads)`, in time linear in atoms.
-
-    `q` (rows, n_heads, n, d) of unit length, so that s = 2 - 2 q_i.q_j; `phi` = a - 4 b and `psi` = 4 b (n_heads,
-    n_types, n_types). Sums over pairs of types need sums of q and of q q^T over each type alone.
-    """
+    """Return sum_ij rho_ij(|q_i - q_j|^2) / n^2 by head, `(rows, n_heads)`, in time linear in atoms: `q` (rows,
+    n_heads, n, d) of unit length, so that s = 2 - 2 q_i.q_j; `phi` = a - 4 b and `psi` = 4 b (n_heads, n_types,
+    n_types)."""
     phi, psi = (m[:, fabric.present][:, :, fabric.present] for m in (phi, psi))
     b = 0.25 * psi
     a = phi + psi
@@ -404,9 +396,8 @@ def latent_energy(q: Tensor, phi: Tensor, psi: Tensor, fabric: Fabric) -> Tensor
 
 
 # The potential by SIMD: copies of a molecule at once, each in its own element of the processor's vector registers.
-# `simd.cpp` computes energies and their mean's gradient as `EnergyNetwork` and torch do, in single precision, without
-# writing what a pair of atoms sees to memory, and moves the copies by it with the bath and rigid bonds of
-# md_reference.simd. This machine's C++ compiler makes it at first use, in seconds.
+# `simd.cpp` computes energies and their mean's gradient as `EnergyNetwork` and torch do, in single precision, and moves
+# the copies by it with the bath and rigid bonds of md_reference.simd. It is compiled at first use, in seconds.
 
 _SOURCE = Path(__file__).with_name("simd.cpp")
 # Copies at once: of a whole register, and where no more are asked for; of the register in bytes.
@@ -596,11 +587,8 @@ def _aligned(n_floats: int) -> npt.NDArray[Any]:
 
 
 class PainetPotential(Potential):
-    """A scalar energy, invariant to rotations, reflections, translations and the order of like atoms, and smooth; its
-    exact gradient as forces, so that momentum, angular momentum and energy are kept.
-
-    Energies are `energy_offset_kj_mol` plus the network's times `energy_scale_kj_mol`, both of training.
-    """
+    """A scalar energy, invariant to rotations, reflections, translations and the order of like atoms, and smooth:
+    `energy_offset_kj_mol` plus the network's times `energy_scale_kj_mol`, both of training."""
 
     arch: ClassVar[str] = "painet-potential"
     config: PotentialConfig

@@ -24,10 +24,10 @@ from surrogate.training.loop import ProgressFn, Stage, StageConfig, train_stages
 from systems.errors import InputError
 from systems.units import GAS_CONSTANT_KJ_MOL_K
 
-# Energy-descent all-pair attention with type matrices, dense and factored.
-# With rho_ij(s) = a_ij s - b_ij s^2 and embeddings of unit length, rho'(|h_i - h_j|^2) = phi_ij + psi_ij h_i.h_j, where
-# phi = a - 4 b and psi = 4 b (papers/PAINET, "Particle-type Adaptive Mapping"). The attention's mean over all particles
-# with these weights is a descent step of the energy sum_ij rho_ij(|h_i - h_j|^2).
+# Energy-descent all-pair attention with type matrices, dense and factored (papers/PAINET, "Particle-type Adaptive
+# Mapping"). With rho_ij(s) = a_ij s - b_ij s^2 and embeddings of unit length, rho'(|h_i - h_j|^2) = phi_ij + psi_ij
+# h_i.h_j, where phi = a - 4 b and psi = 4 b. The attention's mean over all particles with these weights is a descent
+# step of the energy sum_ij rho_ij(|h_i - h_j|^2).
 
 # Index lists of each type's atoms: what the factored form sums over.
 TypeGroups = list[Tensor]
@@ -223,8 +223,7 @@ MESSAGE_NUMBERS = 2_000_000
 
 @dataclass(frozen=True)
 class PainetConfig(ModelConfig):
-    """Size, horizon and physics. `n_new` frames are predicted at once, `frame_stride` reference frames apart: 1 frame
-    at a large stride is state-to-state, several are state-to-trajectory.
+    """Size, horizon and physics. `n_new` frames are predicted at once, `frame_stride` reference frames apart.
 
     `attention` 'linear' (factored over types, cost linear in atoms), 'dense' (the same numbers, quadratic) or 'none'
     (the decoder alone, which is EGNN). `lag_ps` between predicted frames, `temperature_k` and `friction_per_ps` of the
@@ -389,10 +388,9 @@ class EgnnForecaster(Painet):
 @dataclass(frozen=True)
 class PainetTraining:
     """The optimisation. `noise`: standard deviation of what is added to the state a training window starts from, as a
-    share of what positions and velocities change by over a chunk, so that the model learns to come back from its own
-    errors (Sanchez-Gonzalez 2020). `pushforward`: share of windows that start where the model itself arrives after one
-    chunk from the reference, with no gradient through that chunk (Brandstetter 2022). `velocity_weight`: of the last
-    frame's velocity beside the positions, each in units of its own change over a chunk."""
+    share of what positions and velocities change by over a chunk (Sanchez-Gonzalez 2020). `pushforward`: share of
+    windows that start where the model itself arrives after one chunk from the reference, with no gradient through that
+    chunk (Brandstetter 2022). `velocity_weight`: of the last frame's velocity beside the positions."""
 
     budget_s: float | None = None
     steps: int | None = None
@@ -432,10 +430,8 @@ def train_painet(
     resume: bool = False,
     progress: ProgressFn | None = None,
 ) -> Path:
-    """Train on `frames`, which carry velocities, and write `out` (.safetensors) with a CSV of the curves beside it.
-
-    Raises InputError when the frames carry none or are too short, SimulationError when training diverges.
-    """
+    """Train on `frames` and write `out` (.safetensors) with a CSV of the curves beside it. Raises InputError when they
+    carry no velocities or are too short, SimulationError when training diverges."""
     out = Path(out)
     if frames.velocities is None:
         raise InputError(f"{model_class.arch} learns from velocities; these frames carry none.")
@@ -468,12 +464,9 @@ def train_painet(
 
 
 class StateWindows:
-    """States and their futures, cut from frames: two chunks long, so that a pushforward has a reference to compare
-    with.
-
+    """States and their futures, cut from frames: two chunks long, so that a pushforward has a reference.
     `position_scale_nm`, `change_scale_nm_ps`: root mean square displacement and change of velocity over a chunk, what
-    errors are measured in; `velocity_scale_nm_ps`: root mean square velocity.
-    """
+    errors are measured in; `velocity_scale_nm_ps`: root mean square velocity."""
 
     def __init__(self, frames: TrainingFrames, config: PainetConfig, device: torch.device) -> None:
         assert frames.velocities is not None

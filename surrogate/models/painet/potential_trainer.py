@@ -1,8 +1,5 @@
-"""Training of PAINET as a potential, by active learning from an expensive reference.
-
-States come from hot MD and turned torsions (the labeller's `explore`), then from the model's own rollouts. Members of
-the potential learn from different samples; states where their forces spread most are labelled next.
-"""
+"""Training of PAINET as a potential, by active learning from an expensive reference. States come from hot MD and turned
+torsions, then from the model's own rollouts; those where the forces of its members spread most are labelled next."""
 
 from __future__ import annotations
 
@@ -50,13 +47,9 @@ class Samples:
 
     def joined(self, other: Samples) -> Samples:
         """Return both, without what lies too high above the lowest."""
-        parts = (np.concatenate([getattr(self, f.name), getattr(other, f.name)]) for f in fields(Samples))
-        return (together := Samples(*parts)).plausible(together)
-
-    def plausible(self, others: Samples) -> Samples:
-        """Return those of the others that a rollout may visit, by how far they lie above the lowest of these."""
-        highest = self.energies_kj_mol.min(initial=np.inf) + _HIGHEST_KJ_MOL * self.positions_nm.shape[1]
-        return others.where(others.energies_kj_mol < highest)
+        both = Samples(*(np.concatenate([getattr(self, f.name), getattr(other, f.name)]) for f in fields(Samples)))
+        highest = both.energies_kj_mol.min(initial=np.inf) + _HIGHEST_KJ_MOL * both.positions_nm.shape[1]
+        return both.where(both.energies_kj_mol < highest)
 
     def where(self, chosen: Any) -> Samples:
         """Return those that are chosen, by a mask or by numbers."""
@@ -189,7 +182,7 @@ class Learner:
         self.model, self.reference, self.config = model, reference, config
         self.molecule = Molecule.of(reference.scene)
         self.fabric = model.fabric(self.molecule)
-        self.path, self.rounds_path = samples_path(out), out.with_name(f"{out.stem}.rounds.csv")
+        self.path = samples_path(out)
         self.key = reference.scene.topology_hash
         self.samples = Samples.none(reference.scene.n_atoms)
         self.error_kj_mol_nm = np.inf
@@ -201,8 +194,6 @@ class Learner:
             self._spent_s, self._steps = float(rows[-1]["spent_s"]), int(rows[-1]["step"])
         if resume and self.path.exists():
             self.samples = Samples.load(self.path, self.key)
-        else:
-            self.rounds_path.unlink(missing_ok=True)
         self._budget_s, self._started = config.budget_s, time.monotonic()
         self._labelling = True
         self._labelling_s, self._labelled = 0.0, 0
@@ -253,27 +244,24 @@ class Learner:
         return force + c.energy_weight * energy, {"force": force.detach(), "energy": energy.detach()}
 
     def errors(self) -> dict[str, float]:
-        """Errors on held-out states: of forces in kJ/mol/nm, mean absolute and root mean square, beside the mean
-        absolute force, and of energies (less their mean) in kJ/mol, beside the members' spread there; how many states
-        have been labelled."""
+        """Errors on held-out states, of forces in kJ/mol/nm and of energies (less their mean) in kJ/mol; how many
+        states have been labelled."""
         numbers = np.flatnonzero(self.samples.held)
         some = np.linspace(0, len(numbers) - 1, min(len(numbers), _MEASURED)).astype(int)
-        held = self.samples.where(numbers[some])
-        found = self._measured(held)
-        self.error_kj_mol_nm = found["force_mae"]
-        return {f"validation_{k}": v for k, v in found.items()} | {"evaluations": float(len(self.samples))}
-
-    def _measured(self, samples: Samples) -> dict[str, float]:
-        x, energies, forces = samples.tensors()
+        x, energies, forces = self.samples.where(numbers[some]).tensors()
         parts = [self.model.evaluate(part, self.molecule) for part in x.split(256)]
         wrong = torch.cat([part.forces_kj_mol_nm for part in parts]) - forces
         off = torch.cat([part.energy_kj_mol for part in parts]) - energies
+        self.error_kj_mol_nm = float(wrong.abs().mean())
         return {
-            "force_mae": float(wrong.abs().mean()),
-            "force_rms": float(wrong.square().mean().sqrt()),
-            "mean_force": float(forces.abs().mean()),
-            "energy_mae": float((off - off.mean()).abs().mean()),
-            "energy_spread": float(torch.cat([part.members_kj_mol for part in parts]).std(-1, correction=0).mean()),
+            "validation_force_mae": self.error_kj_mol_nm,
+            "validation_force_rms": float(wrong.square().mean().sqrt()),
+            "validation_mean_force": float(forces.abs().mean()),
+            "validation_energy_mae": float((off - off.mean()).abs().mean()),
+            "validation_energy_spread": float(
+                torch.cat([part.members_kj_mol for part in parts]).std(-1, correction=0).mean()
+            ),
+            "evaluations": float(len(self.samples)),
         }
 
     def _label_if_due(self, generator: torch.Generator) -> None:
@@ -307,7 +295,7 @@ class Learner:
         rest = pool[order[n // 2 :]]
         spread = self.spread(torch.from_numpy(rest))
         unsure = rest[np.argsort(-spread)[: n - len(any_)]]
-        self._label(any_, held=2 * self.config.held_share, measured=True)
+        self._label(any_, held=2 * self.config.held_share)
         self._label(unsure, held=0.0)
         self._labelling_s, self._labelled = self._labelling_s + time.monotonic() - began, self._labelled + n
 
@@ -340,8 +328,8 @@ class Learner:
         found = torch.cat(frames)
         return found[torch.isfinite(found).all(-1).all(-1) & (found.abs().amax((1, 2)) < 10.0)].numpy()
 
-    def _label(self, states: Any, *, held: float, measured: bool = False) -> None:
-        """Label states and learn from them; `measured`: note the error before."""
+    def _label(self, states: Any, *, held: float) -> None:
+        """Label states, of which a share is `held` out, and learn from them."""
         answers = self.reference.label(states)
         n = len(answers.energies_kj_mol)
         if not n:
@@ -350,9 +338,6 @@ class Learner:
             return
         kept = np.arange(n) < round(held * n)
         new = Samples(answers.positions_nm, answers.energies_kj_mol, answers.forces_kj_mol_nm, kept)
-        if measured:
-            row = {"evaluations": len(self.samples), "share": self.share, **self._measured(self.samples.plausible(new))}
-            loop.append_row(self.rounds_path, row)
         self.samples = self.samples.joined(new)
         self.samples.save(self.path, self.key)
         self._use()
@@ -378,9 +363,8 @@ def learn_potential(
     reference: ReferenceForces, out: Path, model_config: PotentialConfig, config: PotentialTraining, *,
     resume: bool = False, progress: loop.ProgressFn | None = None, before_s: float = 0.0, after_s: float = 0.0,
 ) -> Path:  # fmt: skip
-    """Learn a molecule's energies and forces and write weights `out`; beside them stay the samples, the curves (.csv)
-    and the error of forces against evaluations, round by round (NAME.rounds.csv). Of the budget `before_s` are spent
-    already, and `after_s` are wanted by the caller, for later."""
+    """Learn a molecule's energies and forces and write weights `out`; beside them stay the samples and the curves
+    (.csv). Of the budget `before_s` are spent already, and `after_s` are wanted by the caller, for later."""
     began = time.monotonic() - before_s
     torch.manual_seed(config.seed)
     model = PainetPotential(model_config)

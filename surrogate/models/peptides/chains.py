@@ -354,10 +354,9 @@ def _unit(x: Tensor) -> Tensor:
 
 
 # Frames of peptides as the flow leaves them, mended by small turns. A flow draws some torsions a few degrees beyond the
-# end of the state that it should be in, rotors above all, and some atoms nearer to each other than they ever come in
-# MD. Drawing whole chunks again for that costs more than the chunks themselves, and favours tight ones. Torsions are
-# mirrored at the end of their state instead, and those of frames in which atoms overlap are turned downhill until none
-# do.
+# end of the state that it should be in, and some atoms nearer to each other than they ever come in MD. Drawing whole
+# chunks again for that is expensive and favours tight ones: torsions are mirrored at the end of their state instead,
+# and those of frames in which atoms overlap are turned downhill until none do.
 
 # A torsion is mirrored that is not further beyond the end of its state; it then stands at least so far inside.
 _MIRRORED_DEG, _INSIDE_DEG = 30.0, 0.05

@@ -32,12 +32,12 @@ _MOST_TRIED = 8
 
 
 def standard_peptide(scene: Scene) -> tuple[Scene, npt.NDArray[np.int64]]:
-    """Return the peptide as `build_peptide` makes it, at the positions of `scene`, and the order of its atoms.
+    """Return the peptide as `build_peptide` makes it, at the positions of `scene`, and its `order` (n_atoms,): atom k
+    is atom `order[k]` of `scene`.
 
-    Its atom k is atom `order[k]` of `scene`, `order` (n_atoms,). The sequence is read from the residues' names, those
-    of Amber, CHARMM and GROMACS included; atoms are matched by their bonds and handedness, so that their names and
-    order play no part. Raises InputError for a scene that is no single chain of the twenty amino acids between their
-    usual ends, or has another handedness than L.
+    The sequence is read from the residues' names, those of Amber, CHARMM and GROMACS included; atoms are matched by
+    their bonds and handedness. Raises InputError for a scene that is no single chain of the twenty L amino acids
+    between their usual ends.
     """
     names = [template.name if (template := template_for(name)) else name for name in scene.residue_names]
     hydrogens = sum(element == "H" for element in scene.elements)
@@ -82,12 +82,8 @@ _TETRAHEDRAL = {"C": 4, "N": 4, "O": 2, "S": 2}
 
 
 def chain_layout(scene: Scene) -> chains.ChainLayout:
-    """Return how the atoms of one peptide chain follow from internal coordinates.
-
-    Residues and atom names are those of `systems.prepare.peptide.build_peptide`; a chain with other names is matched to
-    one first. Torsions are those about bonds in no ring. Raises InputError for a scene that is no single chain of amino
-    acids with at least one peptide bond.
-    """
+    """Return how the atoms of one peptide chain, named as by `systems.prepare.peptide.build_peptide`, follow from
+    internal coordinates. Raises InputError for a scene that is no single chain with at least one peptide bond."""
     graph = bonded_graph(scene)
     if not len(backbone_torsions(scene)["omega"]) or not nx.is_connected(graph):
         raise InputError(f"{scene.name} is no single peptide chain, which residues as tokens need.")
@@ -153,10 +149,8 @@ class _Builder:
         raise InputError(f"{self.scene.name} begins with {self.scene.residue_names[0]}, no cap and no amino acid.")
 
     def _names(self) -> list[str]:
-        """Return the atoms' names, those of hydrogens on one atom given anew by where they stand.
-
-        Which of two hydrogens is HB2 differs between molecules and programs, and no motion turns one into the other.
-        """
+        """Return the atoms' names, those of hydrogens on one atom given anew by where they stand: which of two is HB2
+        differs between programs, and no motion turns one into the other."""
         names, x = list(self.scene.atom_names), self.scene.positions_nm
         for near in range(self.scene.n_atoms):
             hydrogens = [i for i in self.graph[near] if self.scene.elements[i] == "H"]
@@ -280,10 +274,8 @@ class PeptideConfig(ModelConfig):
         return torch.logspace(math.log10(self.shortest_ps), math.log10(self.longest_ps), n, dtype=torch.float64).float()
 
     def places(self, residues: tuple[str, ...]) -> Tensor:
-        """Return the numbers `(n_residues, 3)` of each residue's type, the one's before and the one's after.
-
-        Raises InputError for a type that training did not see.
-        """
+        """Return the numbers `(n_residues, 3)` of each residue's type, the one's before and the one's after. Raises
+        InputError for a type that training did not see."""
         numbers = {name: k for k, name in enumerate((*ENDS, *self.types))}
         if unseen := [name for name in residues if name not in numbers]:
             raise InputError(

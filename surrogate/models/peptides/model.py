@@ -11,7 +11,6 @@ overlap, are mended by small turns; chunks with frames where that is not enough 
 
 from __future__ import annotations
 
-import copy
 import math
 from typing import ClassVar, NamedTuple, cast
 
@@ -35,9 +34,7 @@ from systems.errors import InputError
 from systems.scene import Scene
 
 # Which state each torsion with barriers is in, drawn before the flow draws the frames that go with it: a flow that
-# draws barrier crossings along with everything else leaks between states, since between two modes of noise there is
-# always some density, and a categorical draw does not. The flow is conditioned on the outcome, and frames that disobey
-# are drawn again.
+# draws barrier crossings along with everything else leaks between states, and a categorical draw does not.
 
 _WIDTH = 96
 _WAVES = 8
@@ -50,10 +47,9 @@ _FAST = 10.0
 class StateJumps(nn.Module):
     """The probabilities that torsions change their states between a frame and the next.
 
-    They follow from the residue's type, its numbers in the given frame, its states and its two neighbours' in that and
-    in the frame before, its own in the one before that, the new states of its torsions before this one (side chains
-    turn two torsions at once), and both times. Of neighbours' types only levels are learned, which add up: else the
-    network would know each pair of training by itself.
+    They follow from the residue's type, its numbers in the given frame, its and its two neighbours' states in that and
+    in the frame before, its own in the one before that, the new states of its torsions before this one, and both times.
+    Of neighbours' types only levels are learned, which add up: else the network would know each pair of training.
     """
 
     def __init__(self, n_slots: int, n_types: int) -> None:
@@ -358,6 +354,7 @@ class PeptideSlide(Propagator):
         n_types, n_slots = len(config.types) + len(ENDS), config.scale.n_slots
         self.flow = PeptideFlow(config, n_slots)
         self.jumps = StateJumps(n_slots, n_types)
+        self.lag_range_ps = config.shortest_ps, config.longest_ps
         self.lag_ps = config.shortest_ps
         self.token_mean = nn.Buffer(torch.zeros(n_types, MOST_STATES, n_slots))
         self.token_scale = nn.Buffer(torch.ones(n_types, n_slots))
@@ -372,15 +369,6 @@ class PeptideSlide(Propagator):
     def n_new(self) -> int:
         assert self.lag_ps is not None
         return max(1, min(self.config.chunk_frames, int(self.config.longest_ps / self.lag_ps * (1 + 1e-6))))
-
-    def at_lag(self, lag_ps: float) -> PeptideSlide:
-        """Return this model, its weights shared, with frames `lag_ps` apart. Raises InputError outside its range."""
-        c = self.config
-        if not c.shortest_ps * (1 - 1e-6) <= lag_ps <= c.longest_ps * (1 + 1e-6):
-            raise InputError(f"a lag of {lag_ps:g} ps is none that this model was trained for.")
-        model = copy.copy(self)
-        model.lag_ps = lag_ps
-        return model
 
     def normalised(self, frames_nm: Tensor, chain: ChainFeatures) -> tuple[Tensor, Tensor]:
         """Frames `(..., n_atoms, 3)` nm -> numbers `(..., n_residues, n_slots)`, zero in empty places, and the states

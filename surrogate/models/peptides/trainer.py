@@ -34,11 +34,10 @@ from surrogate.models.weights import Weights, load_weights, provenance_of, read_
 from surrogate.training.loop import ProgressFn, Stage, StageConfig, train_stages
 from systems.errors import InputError
 
-# The probabilities of entering phi > 0, set to those of leaving it and to how likely it is. Runs from chosen starts
-# show hundreds of exits from phi > 0 and hardly an entry, and a rate that is three times too high shows in no loss.
-# What is known well are the probabilities of leaving and the free energy of phi > 0 (umbrella sampling), and in
-# equilibrium as many frames enter as leave. So after training the probabilities of entering are moved, by a level of
-# each residue's type and of its neighbours', to where this holds in the mean over the frames of all training peptides.
+# Runs from chosen starts show hundreds of exits from phi > 0 and hardly an entry, and a rate that is three times too
+# high shows in no loss. So after training the probabilities of entering are moved, by a level of each residue's type
+# and of its neighbours', to where as many frames enter as leave in the mean over all training peptides, given the
+# probabilities of leaving and the free energy of phi > 0 (umbrella sampling).
 
 # Frames of either side at which probabilities are read, drawn anew by this seed, and how long after them.
 _SIDE_FRAMES, _SIDE_SEED = 1000, 0
@@ -158,10 +157,9 @@ _LEAST_SCALE = 0.05
 class PeptideTraining:
     """Optimisation (AdamW, EMA 0.999), in seconds of training or steps.
 
-    `time_reversal`: MD in equilibrium looks alike backwards. Windows are read backwards, too, and frames drawn from
-    equilibrium stand for endless times, both weighted by a Markov model of each molecule (`models.peptides.subjects`).
-    `positive_phi_kt`: of residue types, the free energy of phi > 0 over phi < 0 in kT where it is known (metadynamics);
-    short runs leave that state and hardly ever enter it.
+    `time_reversal`: windows are read backwards, too, and frames drawn from equilibrium stand for endless times, both
+    weighted by a Markov model of each molecule (`models.peptides.subjects`). `positive_phi_kt`: of residue types, the
+    free energy of phi > 0 over phi < 0 in kT, from metadynamics.
     """
 
     budget_s: float | None = None
@@ -191,8 +189,7 @@ def train_peptides(
     flow, conditioned on the states of torsions, then the probabilities of these states, which share nothing with it.
 
     `unseen`: sequences held out whole, whose loss the curves show. `start`: weights to go on from, with their scales.
-    Every frame of `sets` outside the split is trained on; windows start anywhere. Raises InputError for scenes that are
-    no chains, SimulationError when training diverges.
+    Raises InputError for scenes that are no chains, SimulationError when training diverges.
     """
     out = Path(out)
     torch.manual_seed(training.seed)
@@ -335,11 +332,8 @@ def _places(config: PeptideConfig, key: str) -> tuple[slice, EllipsisType, slice
 
 @torch.no_grad()
 def normalise(model: PeptideSlide, subjects: Sequence[PeptideSubject], seed: int) -> None:
-    """Measure what centres and scales each residue type's numbers, and their correlations in time, and set them.
-
-    A torsion's cosine and sine share one scale, the root of their mean variance, and one correlation; a free end's
-    numbers are alike in residues of all types.
-    """
+    """Measure what centres and scales each residue type's numbers, and their correlations in time, and set them. A
+    torsion's cosine and sine share one scale and one correlation; a free end's numbers are alike in all residues."""
     assert model.config.scale is not None
     slots = model.config.scale.slots
     of_ends = [_places(model.config, key) for key in slots if key.split()[0] in chains.FREE_ENDS]
