@@ -156,7 +156,6 @@ class TrainingFrames:
 
     @property
     def origin(self) -> dict[str, Any]:
-        """See `FrameSets.origin`."""
         return FrameSets((self,)).origin
 
     def refuse_leaks(self) -> None:

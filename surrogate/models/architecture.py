@@ -53,10 +53,10 @@ class ModelConfig:
 
 
 def toml_text(record: dict[str, Any], table: str = "") -> str:
-    """Return a record of texts, numbers, booleans, and lists and tables of these as TOML, without values that are None;
-    tables in lists are written in one line."""
+    """Return a record of texts, numbers, booleans, lists of these, and tables as TOML, without values that are None."""
     kept = {key: value for key, value in record.items() if value is not None}
-    lines = [f"{key} = {_inline(value)}" for key, value in kept.items() if not isinstance(value, dict)]
+    # JSON's texts, booleans, finite numbers and lists are TOML's.
+    lines = [f"{key} = {json.dumps(value)}" for key, value in kept.items() if not isinstance(value, dict)]
     text = "".join(f"{line}\n" for line in lines)
     if table and (lines or not kept):
         text = f"[{table}]\n{text}"
@@ -64,16 +64,6 @@ def toml_text(record: dict[str, Any], table: str = "") -> str:
         if isinstance(value, dict):
             text += ("\n" if text else "") + toml_text(value, f"{table}.{key}" if table else key)
     return text
-
-
-def _inline(value: Any) -> str:
-    if isinstance(value, dict):
-        pairs = [f"{key} = {_inline(each)}" for key, each in value.items() if each is not None]
-        return "{" + ", ".join(pairs) + "}"
-    if isinstance(value, list | tuple):
-        return "[" + ", ".join(_inline(each) for each in value) + "]"
-    # JSON's texts, booleans and finite numbers are TOML's.
-    return json.dumps(value)
 
 
 @dataclass(frozen=True)

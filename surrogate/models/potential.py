@@ -84,14 +84,13 @@ class Potential(Propagator):
     """Energies and forces: a learned potential, which is a propagator by the MD that is run on it.
 
     A subclass sets `arch` and `config` (an `IntegratorConfig` or what extends it) and implements `energies`, a
-    differentiable function of positions; forces are its exact gradient, so that energy is kept. Masses, rigid bonds to
-    hydrogen, thermostat and chunks are here: Langevin middle (Zhang 2019) or velocity Verlet, in double precision, with
-    the centre of mass at rest. It may override `gradient` where it has a faster one than torch's, and `featurise`,
-    whose `own` is then a `RigidBonds` or None.
+    differentiable function of positions; forces are its exact gradient. Masses, rigid bonds to hydrogen, thermostat and
+    chunks are here: Langevin middle (Zhang 2019) or velocity Verlet, in double precision, with the centre of mass at
+    rest. It may override `gradient` where it has a faster one than torch's, and `featurise`, whose `own` is then a
+    `RigidBonds` or None.
 
-    What holds for every potential, beside what holds for every propagator (`surrogate.models.conformance`): the energy
-    does not depend on where the molecule lies and how it is turned, is finite and smooth wherever MD may lead it, and
-    does not depend on the frames evaluated beside it.
+    Beside what holds for every propagator (`surrogate.models.conformance`), the energy does not depend on where the
+    molecule lies, how it is turned and what is evaluated beside it, and is finite and smooth wherever MD may lead it.
     """
 
     config: Any

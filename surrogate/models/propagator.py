@@ -128,15 +128,9 @@ class Propagator(nn.Module, ABC):
 
     @abstractmethod
     def next_chunk(
-        self,
-        last_frames_nm: Tensor,
-        molecule: Molecule,
-        noise: Tensor,
-        *,
-        solver_steps: int = 1,
-        solver: str | None = None,
-        last_velocities_nm_ps: Tensor | None = None,
-    ) -> Chunk:
+        self, last_frames_nm: Tensor, molecule: Molecule, noise: Tensor, *, solver_steps: int = 1,
+        solver: str | None = None, last_velocities_nm_ps: Tensor | None = None,
+    ) -> Chunk:  # fmt: skip
         """Return the frames that follow.
 
         Args:

@@ -65,14 +65,12 @@ class TrainingDomain:
 
     def describe(self) -> str:
         """One line for people: 'alanine-dipeptide (C6H12N2O2, 22 atoms), ff14SB/obc2, 300 K, frames 1 ps apart'."""
-        c = self.conditions
+        c, names = self.conditions, [domain.scene.name for domain in self.members]
         lags = f"{self.lag_ps:g}" + (f" to {self.longest_lag_ps:g}" if self.jumps else "")
         what = f"{self.scene.name} ({self.scene.formula}, {self.scene.n_atoms} atoms)"
         if self.further:
-            names = [domain.scene.name for domain in self.members]
-            listed = ", ".join(names[:6]) + (f" and {len(names) - 6} more" if len(names) > 6 else "")
-            most = max(domain.scene.n_atoms for domain in self.members)
-            what = f"{len(names)} molecules of up to {most} atoms ({listed})"
+            more = f" and {len(names) - 6} more" if len(names) > 6 else ""
+            what = f"{len(names)} molecules ({', '.join(names[:6])}{more})"
         what += " and molecules like them" if self.transferable else ""
         return f"{what}, {c.get('force_field')}/{c.get('solvent')}, {c.get('temperature_k')} K, frames {lags} ps apart"
 

@@ -11,7 +11,7 @@ import time
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +20,7 @@ from torch import Tensor, nn
 
 from surrogate.training import devices
 from systems.errors import InputError, SimulationError, first_line
-from systems.files.schema import built, parsed
+from systems.files.schema import parsed
 from systems.files.whole_file import create_whole
 from systems.interrupts import stop_if_asked
 
@@ -353,14 +353,9 @@ def run_stage(stage: Stage, place: StagePlace, *, progress: ProgressFn | None = 
 
 
 def train_stages(
-    stages: Iterable[Stage],
-    out: Path,
-    write: Callable[[list[float]], None],
-    *,
-    device: torch.device,
-    resume: bool = False,
-    progress: ProgressFn | None = None,
-) -> None:
+    stages: Iterable[Stage], out: Path, write: Callable[[list[float]], None], *, device: torch.device,
+    resume: bool = False, progress: ProgressFn | None = None,
+) -> None:  # fmt: skip
     """Train stage after stage and write the weights `out`; beside them stand a CSV of the curves and, until all is
     done, the state of each stage (NAME.STAGE.train.safetensors), from which `resume` goes on.
 
@@ -408,18 +403,6 @@ def optimisers_of(module: nn.Module, config: StageConfig) -> list[torch.optim.Op
     return [adam, Muon(matrices, config.matrix_rate, config.weight_decay)]
 
 
-@dataclass(frozen=True)
-class StateHeader:
-    """What a training state says of itself."""
-
-    step: int
-    spent_s: float
-    stage: str
-    seed: int
-    batch: int
-    matrix_rate: float | None = None
-
-
 def save_state(path: Path, module: nn.Module, ema: Ema, optimisers: list[torch.optim.Optimizer],
                generator: torch.Generator, step: int, spent_s: float, config: StageConfig) -> None:  # fmt: skip
     """Write the training state whole or not at all."""
@@ -429,21 +412,22 @@ def save_state(path: Path, module: nn.Module, ema: Ema, optimisers: list[torch.o
         for index, state in optimiser.state_dict()["state"].items():
             tensors |= {f"optimiser{number or ''}.{index}.{k}": v for k, v in state.items()}
     tensors["generator"] = generator.get_state()
-    header = StateHeader(step, spent_s, config.name, config.seed, config.batch, config.matrix_rate)
-    save_tensors(path, "surromd_training", asdict(header), tensors)
+    save_tensors(path, "surromd_training", {"step": step, "spent_s": spent_s, **_of_run(config)}, tensors)
+
+
+def _of_run(config: StageConfig) -> dict[str, Any]:
+    """Return what a state has in common with the run that may go on from it."""
+    return {"stage": config.name, "seed": config.seed, "batch": config.batch, "matrix_rate": config.matrix_rate}
 
 
 def load_state(path: Path, module: nn.Module, ema: Ema, optimisers: list[torch.optim.Optimizer],
                generator: torch.Generator, config: StageConfig) -> tuple[int, float]:  # fmt: skip
     """Put a saved state back; return (step, spent_s). Raises InputError when it is damaged or of another run."""
     record, tensors = load_tensors(path, "surromd_training")
-    header = built(StateHeader, record)
-    for key, expected in (("stage", config.name), ("seed", config.seed), ("batch", config.batch),
-                          ("matrix_rate", config.matrix_rate)):  # fmt: skip
-        if getattr(header, key) != expected:
+    for key, expected in _of_run(config).items():
+        if (found := record.get(key)) != expected:
             raise InputError(
-                f"training state {path} has {key} {getattr(header, key)!r}, this run {expected!r}; "
-                "remove it to train anew."
+                f"training state {path} has {key} {found!r}, this run {expected!r}; remove it to train anew."
             )
     sub = lambda prefix: {k[len(prefix) :]: v for k, v in tensors.items() if k.startswith(prefix)}  # noqa: E731
     try:
@@ -459,4 +443,4 @@ def load_state(path: Path, module: nn.Module, ema: Ema, optimisers: list[torch.o
             state.setdefault(int(index), {})[name] = tensor
         optimiser.load_state_dict({"state": state, "param_groups": optimiser.state_dict()["param_groups"]})
     generator.set_state(tensors["generator"])
-    return header.step, header.spent_s
+    return record["step"], record["spent_s"]

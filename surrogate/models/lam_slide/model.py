@@ -173,13 +173,6 @@ def pair_distances(x: Tensor) -> Tensor:
     return (difference.square().sum(-1) + 1e-12).sqrt()
 
 
-def reconstruction_losses(x: Tensor, decoded: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the position loss (eq. 13) and the inter-distance loss (eq. 14), in scaled units squared."""
-    position = (x - decoded).square().sum(-1).mean()
-    distance = (pair_distances(x) - pair_distances(decoded)).square().mean()
-    return position, distance
-
-
 # Stage two: the latent flow model, transformer layers alternating over latents and time (Algorithms 4 and 5).
 
 Rope = tuple[Tensor, Tensor]

@@ -21,7 +21,7 @@ from surrogate.models.lam_slide.model import (
     LamSlide,
     LamSlideConfig,
     draw_identifiers,
-    reconstruction_losses,
+    pair_distances,
 )
 from surrogate.models.weights import Weights, load_weights, provenance_of, read_header, save_weights, training_domain
 from surrogate.training.devices import bf16_pays
@@ -62,7 +62,8 @@ def autoencoder_loss(
     latents = model.autoencoder.encode(x, numbers, identifiers)
     noise = torch.randn(latents.shape, generator=generator).to(x.device)
     decoded = model.autoencoder.decode(latents + c.latent_noise * noise, identifiers, with_types=c.type_weight > 0)
-    position, distance = reconstruction_losses(x, decoded.positions)
+    position = (x - decoded.positions).square().sum(-1).mean()
+    distance = (pair_distances(x) - pair_distances(decoded.positions)).square().mean()
     loss = c.position_weight * position + c.distance_weight * distance
     terms = {"position": position, "distance": distance}
     if decoded.type_logits is not None:
@@ -230,15 +231,9 @@ class TrainingConfig:
 
 
 def train_lam_slide(
-    frames: TrainingFrames,
-    out: str | Path,
-    model_config: LamSlideConfig,
-    config: TrainingConfig,
-    *,
-    start: Weights | None = None,
-    resume: bool = False,
-    progress: ProgressFn | None = None,
-) -> Path:
+    frames: TrainingFrames, out: str | Path, model_config: LamSlideConfig, config: TrainingConfig, *,
+    start: Weights | None = None, resume: bool = False, progress: ProgressFn | None = None,
+) -> Path:  # fmt: skip
     """Train on `frames` and write `out` (.safetensors); beside it a CSV of the curves and, until done, resume states.
 
     With `start`, stage two goes on from those weights for the whole budget, and stage one is taken over as it is.
@@ -390,13 +385,11 @@ class LamSlideTrainer(arch.Trainer):
     learns_lags = True
 
     def check(self, request: arch.TrainingRequest) -> None:
-        """See `Trainer.check`."""
         super().check(request)
         if request.steps is not None and request.steps < 2:
             raise InputError("`steps` must be at least 2: one for each stage.")
 
     def choose(self, references: References, request: arch.TrainingRequest) -> tuple[arch.Choice, ...]:
-        """See `Trainer.choose`."""
         survey, found = references.survey, list[arch.Choice]()
         if request.start_from is not None:
             return ()
@@ -410,7 +403,6 @@ class LamSlideTrainer(arch.Trainer):
         return tuple(found)
 
     def settings(self, request: arch.TrainingRequest) -> arch.Settings:
-        """See `Trainer.settings`."""
         model = request.model if request.start_from is None else read_header(request.start_from).config
         steps, first = request.steps, None
         if steps is not None:
@@ -427,7 +419,6 @@ class LamSlideTrainer(arch.Trainer):
         return arch.Settings(LamSlideConfig.from_dict(model), request.settings(TrainingConfig, asked), _RESOLVED)
 
     def prepare(self, references: References, request: arch.TrainingRequest) -> arch.Prepared:
-        """See `Trainer.prepare`."""
         settings = self.settings(request)
         model: LamSlideConfig = settings.model
         start = None if request.start_from is None else load_weights(request.start_from)

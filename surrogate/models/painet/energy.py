@@ -69,9 +69,8 @@ class PotentialConfig(IntegratorConfig):
             raise InputError(f"step = {self.step:g} and psi_limit = {self.psi_limit:g} must lie between 0 and 1.")
 
 
-# Ordered pairs of atoms within reach of each other, and the smooth functions of their distance that a potential sees.
-# Pairs up to three bonds apart count always, others inside a cutoff, at which all they add has come down to zero with
-# its first two derivatives. So the number of pairs grows with the atoms and not with their square.
+# Ordered pairs of atoms, and the smooth functions of their distance that a potential sees. Pairs up to three bonds
+# apart count always, others inside a cutoff, at which all they add has come to zero with its first two derivatives.
 
 # Shells: one, two and three bonds apart, and all that lie further.
 N_SHELLS = 4
@@ -620,7 +619,6 @@ class PainetPotential(Potential):
         return self._woven
 
     def energies(self, positions_nm: Tensor, molecule: Molecule) -> Tensor:
-        """See `Potential.energies`."""
         return self.members(positions_nm, self.fabric(molecule))
 
     def members(self, positions_nm: Tensor, fabric: Fabric, made: EdgeWeights | None = None) -> Tensor:

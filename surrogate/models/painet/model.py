@@ -421,15 +421,9 @@ def for_frames(config: PainetConfig, frames: TrainingFrames) -> PainetConfig:
 
 
 def train_painet(
-    frames: TrainingFrames,
-    out: str | Path,
-    model_config: PainetConfig,
-    config: PainetTraining,
-    *,
-    model_class: type[Painet] = Painet,
-    resume: bool = False,
-    progress: ProgressFn | None = None,
-) -> Path:
+    frames: TrainingFrames, out: str | Path, model_config: PainetConfig, config: PainetTraining, *,
+    model_class: type[Painet] = Painet, resume: bool = False, progress: ProgressFn | None = None,
+) -> Path:  # fmt: skip
     """Train on `frames` and write `out` (.safetensors) with a CSV of the curves beside it. Raises InputError when they
     carry no velocities or are too short, SimulationError when training diverges."""
     out = Path(out)

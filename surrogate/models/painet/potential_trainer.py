@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, NoReturn, Protocol
 
 import numpy as np
 import torch
@@ -99,8 +99,8 @@ def domain_of(scene: Scene, samples: Samples, moving: list[Any], config: Potenti
     return TrainingDomain(scene, config.lag_ps, conditions, geometry.to_dict(), limits.to_dict(), ())
 
 
-# The share of the budget in which states are labelled; what is missing then is labelled at once, unless a pause or a
-# resumption has brought the training so far that it would hardly learn them.
+# The share of the budget in which states are labelled; what is missing then is labelled at once, unless a resumption
+# comes so late that it would hardly learn them.
 _LABELLING_SHARE, _LAST_LABELLING_SHARE = 0.4, 0.7
 # Most of the budget that new states and their answers may take.
 _LABELLING_TIME_SHARE = 0.3
@@ -381,9 +381,10 @@ def learn_potential(
     if budget_s is not None:
         left_s = budget_s - (time.monotonic() - began) - after_s
         budget_s = max(left_s, _LEARNING_SHARE * budget_s)
-    stage = loop.StageConfig("potential", config.batch, config.learning_rate, budget_s, config.steps,
-                        matrix_rate=config.matrix_rate, seed=config.seed, bf16=False,
-                        validate_every_s=config.validate_every_s)  # fmt: skip
+    stage = loop.StageConfig(
+        "potential", config.batch, config.learning_rate, budget_s, config.steps, matrix_rate=config.matrix_rate,
+        seed=config.seed, bf16=False, validate_every_s=config.validate_every_s,
+    )  # fmt: skip
 
     def advance(name: str, share: float, metrics: dict[str, float]) -> None:
         error = f", force error {learner.error_kj_mol_nm:.3g} kJ/mol/nm" if np.isfinite(learner.error_kj_mol_nm) else ""
@@ -408,16 +409,18 @@ def learn_potential(
 class PotentialTrainer(arch.Trainer):
     """Refuses trajectories, which say too little about forces; `learn` takes a molecule and its reference."""
 
-    def check(self, request: arch.TrainingRequest) -> None:
-        raise _no_trajectories(request)
+    def check(self, request: arch.TrainingRequest) -> NoReturn:
+        raise InputError(
+            f"{request.arch} learns from forces that are computed for it; give a molecule, `arch='painet'` and "
+            "`level='gfn2-xtb'`."
+        )
 
     def settings(self, request: arch.TrainingRequest) -> arch.Settings:
-        """See `Trainer.settings`."""
         training = request.settings(PotentialTraining)
         return arch.Settings(PotentialConfig.from_dict(request.model), training, arch.RESOLVED)
 
     def prepare(self, references: References, request: arch.TrainingRequest) -> arch.Prepared:
-        raise _no_trajectories(request)
+        self.check(request)
 
     def learn(self, reference: ReferenceForces, request: arch.TrainingRequest, advance: Callable[[str, float], None], *,
               before_s: float = 0.0, after_s: float = 0.0) -> Path:  # fmt: skip
@@ -427,13 +430,6 @@ class PotentialTrainer(arch.Trainer):
             reference, request.out, settings.model, settings.training, resume=request.resume,
             progress=lambda stage, share, metrics: advance(stage, share), before_s=before_s, after_s=after_s,
         )  # fmt: skip
-
-
-def _no_trajectories(request: arch.TrainingRequest) -> InputError:
-    return InputError(
-        f"{request.arch} learns from forces that are computed for it; give a molecule, `arch='painet'` and "
-        "`level='gfn2-xtb'`."
-    )
 
 
 PAINET_POTENTIAL = arch.Architecture("painet-potential", PotentialConfig.from_dict, PainetPotential, PotentialTrainer)

@@ -254,16 +254,11 @@ class ChainFeatures:
         places, least_nm = self.places.to(device), self.least_nm.to(device)
         return replace(self, code=code, places=places, stated=self.stated.to(device), least_nm=least_nm)
 
-    @cached_property
-    def signed(self) -> Tensor:
-        """The residues `(n,)` whose phi has two sides."""
-        return self.stated.residue[self.stated.slot == 0]
-
     @property
-    def weighable(self) -> list[int]:
-        """Those of which it can be said how likely phi > 0 is: not before a proline, whose ring leaves them no room."""
-        types = (*self.code.layout.types, "")
-        return [residue for residue in self.signed.tolist() if types[residue + 1] != "PRO"]
+    def signed(self) -> list[int]:
+        """The residues whose phi has two sides, but those before a proline, whose ring leaves them no room."""
+        types, residues = (*self.code.layout.types, ""), self.stated.residue[self.stated.slot == 0].tolist()
+        return [residue for residue in residues if types[residue + 1] != "PRO"]
 
     @cached_property
     def stated_at(self) -> Tensor:

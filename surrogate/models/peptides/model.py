@@ -20,13 +20,7 @@ from torch.nn import functional as F
 
 from surrogate.models.lam_slide import flow
 from surrogate.models.layers import ParallelBlock, TimeEmbedding, rotary_angles
-from surrogate.models.peptides.chains import (
-    MOST_STATES,
-    MOST_TORSIONS,
-    ChainFeatures,
-    conditioning_states,
-    mended,
-)
+from surrogate.models.peptides.chains import MOST_STATES, MOST_TORSIONS, ChainFeatures, conditioning_states, mended
 from surrogate.models.peptides.layout import ENDS, PeptideConfig, chain_features
 from surrogate.models.propagator import Chunk, Molecule, Propagator
 from systems.chemistry.geometry import superpose
@@ -302,14 +296,10 @@ class PeptideFlow(nn.Module):
         angles = rotary_angles(times_ps.shape[1] + 1, self.config.width // self.config.n_heads).to(observed.device)
         place = torch.arange(len(types), device=observed.device)
         apart = (place[:, None] - place).clamp(-_FAR, _FAR) + _FAR
-        return Conditioning(
-            types,
-            of_type,
-            self.of_known(observed[:, None], types) + of_states[:, :1] + self.of_given,
-            self._of_times(times_ps)[:, :, None] + of_states[:, 1:],
-            (angles.cos(), angles.sin()),
-            [cast(PeptideLayer, layer).of_distance(apart).permute(2, 0, 1) for layer in self.layers],
-        )
+        given = self.of_known(observed[:, None], types) + of_states[:, :1] + self.of_given
+        of_frames = self._of_times(times_ps)[:, :, None] + of_states[:, 1:]
+        biases = [cast(PeptideLayer, layer).of_distance(apart).permute(2, 0, 1) for layer in self.layers]
+        return Conditioning(types, of_type, given, of_frames, (angles.cos(), angles.sin()), biases)
 
     def _network(self, o: Tensor, tau: Tensor, conditioning: Conditioning) -> Tensor:
         noisy = self.of_noisy(o, conditioning.types) + conditioning.of_frames
@@ -429,7 +419,6 @@ class PeptideSlide(Propagator):
 
     def next_chunk(self, last_frames_nm: Tensor, molecule: Molecule, noise: Tensor, *, solver_steps: int = 10,
                    solver: str | None = None, last_velocities_nm_ps: Tensor | None = None) -> Chunk:  # fmt: skip
-        """See `Propagator.next_chunk`."""
         chain: ChainFeatures | None = molecule.own
         if chain is None:
             raise InputError("this model knows peptides by residues; make molecules by its `featurise`.")

@@ -153,7 +153,7 @@ class PeptideSubject:
         """Return the pattern of phi's signs of each frame `kept` (n,), as a number, and the population of each pattern:
         residues are taken to be independent, and those whose free energy is not given play no part."""
         states, shares = np.zeros(len(kept), dtype=np.int64), np.ones(1)
-        for residue in self.chain.weighable:
+        for residue in self.chain.signed:
             name = self.frames.scene.residue_names[residue]
             if name in positive_phi_kt:
                 states = states + len(shares) * self._states[kept, residue, 0]

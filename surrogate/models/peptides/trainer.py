@@ -85,7 +85,7 @@ def weighted_phis(model: PeptideSlide, subject: PeptideSubject) -> list[Phi]:
     """Return each phi of a peptide of which frames show both sides and weights say how likely they are; none before a
     proline."""
     found: list[Phi] = []
-    for residue in subject.chain.weighable if subject.weights is not None else ():
+    for residue in subject.chain.signed if subject.weights is not None else ():
         sides = [_side(subject, residue, state) for state in (0, 1)]
         if min(len(idx) for idx, _ in sides) >= _LEAST_FRAMES:
             observed, states = zip(*(subject.seen(model, idx) for idx, _ in sides), strict=True)
@@ -175,16 +175,10 @@ class PeptideTraining:
 
 
 def train_peptides(
-    sets: Sequence[TrainingFrames],
-    out: str | Path,
-    config: PeptideConfig,
-    training: PeptideTraining,
-    *,
-    unseen: Sequence[TrainingFrames] = (),
-    start: Weights | None = None,
-    resume: bool = False,
+    sets: Sequence[TrainingFrames], out: str | Path, config: PeptideConfig, training: PeptideTraining, *,
+    unseen: Sequence[TrainingFrames] = (), start: Weights | None = None, resume: bool = False,
     progress: ProgressFn | None = None,
-) -> Path:
+) -> Path:  # fmt: skip
     """Train on frames of several sequences and write `out` (.safetensors); beside it a CSV of the curves: first the
     flow, conditioned on the states of torsions, then the probabilities of these states, which share nothing with it.
 
@@ -461,7 +455,6 @@ class PeptideTrainer(arch.Trainer):
     learns_lags = True
 
     def choose(self, references: References, request: arch.TrainingRequest) -> tuple[arch.Choice, ...]:
-        """See `Trainer.choose`."""
         survey, found = references.survey, list[arch.Choice]()
         begins = request.start_from is None
         if begins and "shortest_ps" not in request.model and survey.lag_ps != PeptideConfig.shortest_ps:
@@ -477,14 +470,12 @@ class PeptideTrainer(arch.Trainer):
         return tuple(found)
 
     def settings(self, request: arch.TrainingRequest) -> arch.Settings:
-        """See `Trainer.settings`."""
         model = request.model if request.start_from is None else read_header(request.start_from).config
         if request.start_from is not None:  # trained further, a flow forgets the few steps that it was distilled to
             model = {key: value for key, value in model.items() if key not in ("usual_steps", "usual_solver")}
         return arch.Settings(PeptideConfig.from_dict(model), request.settings(PeptideTraining), arch.RESOLVED)
 
     def prepare(self, references: References, request: arch.TrainingRequest) -> arch.Prepared:
-        """See `Trainer.prepare`."""
         settings, sets = self.settings(request), references.sets()
         start = None if request.start_from is None else load_weights(request.start_from)
 

@@ -59,7 +59,7 @@ def test_the_states_of_frames_are_those_of_their_torsions() -> None:
         [0, 0, 0, 0, 0, 0, 0], [0, 2, 0, 0, 0, 0, 0], [2, 2, 3, 3, 3, 3, 3], [2, 2, 3, 3, 0, 0, 0],
         [2, 2, 3, 2, 0, 0, 0], [0, 0, 0, 0, 0, 0, 0],
     ]  # fmt: skip
-    assert chain.signed.tolist() == [2, 3, 4]
+    assert chain.signed == [2, 3, 4]
     both = np.stack([scene.positions_nm, with_phi_turned(scene)])
     found = chain.states(torch.tensor(both))
     quads = [_quad(scene, residue, names) for residue, names in ((2, ("CA", "CB", "CG", "CD")), (3, _CHI1))]
