@@ -77,8 +77,6 @@ class Muon(torch.optim.Optimizer):
 
 # The curves of a training: a CSV that the loop writes, and NAME.svg beside it.
 
-Rows = list[dict[str, str]]
-
 
 def append_row(path: Path, row: dict[str, Any]) -> None:
     """Append a row to a CSV; columns that it does not have yet are added, empty in the rows before."""
@@ -100,16 +98,16 @@ def append_row(path: Path, row: dict[str, Any]) -> None:
     create_whole(path, fill)
 
 
-def read_curves(path: Path) -> dict[str, Rows]:
+def read_curves(path: Path) -> dict[str, list[dict[str, str]]]:
     """Return the rows of a training's CSV by stage, in the order of the training."""
-    stages: dict[str, Rows] = {}
+    stages: dict[str, list[dict[str, str]]] = {}
     with path.open(newline="") as handle:
         for row in csv.DictReader(handle):
             stages.setdefault(row["stage"], []).append(row)
     return stages
 
 
-def series(rows: Rows, column: str) -> tuple[list[float], list[float]]:
+def series(rows: list[dict[str, str]], column: str) -> tuple[list[float], list[float]]:
     """Return the steps and values of one column, where it has any."""
     kept = [row for row in rows if row.get(column)]
     return [float(row["step"]) for row in kept], [float(row[column]) for row in kept]

@@ -283,18 +283,19 @@ def _resolve(frames: TrainingFrames, model_config: LamSlideConfig, config: Train
 
 def _strides(frames: TrainingFrames, model_config: LamSlideConfig) -> tuple[int, ...]:
     """Return the strides that windows are drawn with. Raises InputError for lags that the frames do not have."""
-    lags = model_config.approximator.lag_range_ps
-    if lags is None:
-        return (1,)
-    if not np.isclose(lags[0], frames.lag_ps, rtol=1e-4):
-        raise InputError(f"the model's lags begin at {lags[0]:g} ps, frames of {frames.scene.name} are saved every "
-                         f"{frames.lag_ps:g} ps.")  # fmt: skip
-    longest = whole_steps(lags[1], frames.lag_ps, "the longest lag in the frames' spacing")
-    if longest < 2:
-        raise InputError("the longest lag must be at least twice the frames' spacing; leave it out for one lag alone.")
-    strides = strides_up_to(longest)
-    # Too short a reference is refused before the first stage has been trained.
-    StrideSampler.of(frames, model_config.approximator.chunk_frames, strides)
+    lags, strides = model_config.approximator.lag_range_ps, (1,)
+    if lags is not None:
+        if not np.isclose(lags[0], frames.lag_ps, rtol=1e-4):
+            raise InputError(f"the model's lags begin at {lags[0]:g} ps, frames of {frames.scene.name} are saved every "
+                             f"{frames.lag_ps:g} ps.")  # fmt: skip
+        longest = whole_steps(lags[1], frames.lag_ps, "the longest lag in the frames' spacing")
+        if longest < 2:
+            raise InputError(
+                "the longest lag must be at least twice the frames' spacing; leave it out for one lag alone."
+            )
+        strides = strides_up_to(longest)
+    for validation in (False, True):  # too short a reference is refused before the first stage has been trained
+        StrideSampler.of(frames, model_config.approximator.chunk_frames, strides, validation=validation)
     return strides
 
 
@@ -423,8 +424,6 @@ class LamSlideTrainer(arch.Trainer):
         model: LamSlideConfig = settings.model
         start = None if request.start_from is None else load_weights(request.start_from)
         frames = references.frames(canonical=model.canonical)
-        for validation in (False, True):  # too short a reference is refused before the first stage has been trained
-            frames.window_starts(model.approximator.chunk_frames, validation=validation)
         share_one = 0.0 if start is not None else STAGE_ONE_SHARE
 
         def run(advance: arch.AdvanceFn) -> Path:
