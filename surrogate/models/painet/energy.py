@@ -210,7 +210,7 @@ NO_WALL_NM, _LEAST_NM = 1e3, 1e-3
 
 
 @dataclass(frozen=True, eq=False)
-class Fabric:
+class Topology:
     """What of a molecule does not change while it moves: the shells of its bonds, the types that are `present`, each
     type's atoms."""
 
@@ -222,12 +222,12 @@ class Fabric:
     one_hot: Tensor
 
     @staticmethod
-    def of(molecule: Molecule) -> Fabric:
+    def of(molecule: Molecule) -> Topology:
         present = torch.unique(molecule.elements)
         bonds = torch.cat([molecule.bonds.T, molecule.bonds.T.flip(0)], dim=1)
         one_hot = (present[:, None] == molecule.elements).to(torch.get_default_dtype())
         groups = type_groups(molecule.elements)
-        return Fabric(molecule, bonded_shells(molecule), bonds, present, groups, one_hot)
+        return Topology(molecule, bonded_shells(molecule), bonds, present, groups, one_hot)
 
 
 class EdgeWeights(NamedTuple):
@@ -322,14 +322,14 @@ class EnergyNetwork(nn.Module):
         self.nearest_nm = nn.Buffer(torch.zeros(N_SHELLS, N_TYPES, N_TYPES))
         self.farthest_nm = nn.Buffer(torch.full((N_SHELLS, N_TYPES, N_TYPES), NO_WALL_NM))
 
-    def set_walls(self, positions_nm: Tensor, fabric: Fabric) -> None:
+    def set_walls(self, positions_nm: Tensor, topology: Topology) -> None:
         """Stand walls a little beyond the distances of samples `(n, n_atoms, 3)` nm: the shortest of all pairs of like
         types and as many bonds apart, the longest of those one or two bonds apart."""
-        elements = fabric.molecule.elements
+        elements = topology.molecule.elements
         self.nearest_nm.zero_()
         self.farthest_nm.fill_(NO_WALL_NM)
         extremes: dict[tuple[int, int, int], tuple[float, float]] = {}
-        for (i, j), shell in (_all_pairs(len(elements)) | fabric.shells).items():
+        for (i, j), shell in (_all_pairs(len(elements)) | topology.shells).items():
             distance = (positions_nm[:, i] - positions_nm[:, j]).norm(dim=-1)
             types = shell, *sorted((int(elements[i]), int(elements[j])))
             least, most = extremes.get(types, (NO_WALL_NM, 0.0))
@@ -339,11 +339,11 @@ class EnergyNetwork(nn.Module):
             if shell < WALLED_SHELLS:
                 self.farthest_nm[shell, [a, b], [b, a]] = longest * WALL_MARGIN
 
-    def prepare(self, fabric: Fabric, positions_nm: Tensor) -> EdgeWeights:
+    def prepare(self, topology: Topology, positions_nm: Tensor) -> EdgeWeights:
         """Return what depends on the molecule, and on frames `(rows, n_atoms, 3)` nm by who is near whom."""
-        edges = find_edges(fabric.shells, positions_nm, self.config.cutoff_nm)
-        elements = fabric.molecule.elements
-        z = self.surroundings(self.embed_type(elements), fabric.bonds)
+        edges = find_edges(topology.shells, positions_nm, self.config.cutoff_nm)
+        elements = topology.molecule.elements
+        z = self.surroundings(self.embed_type(elements), topology.bonds)
         of_edge = self.of_pair(torch.cat([z[edges.receiver] + self.of_shell(edges.shell), z[edges.sender]], dim=-1))
         types = edges.shell, elements[edges.receiver], elements[edges.sender]
         # An atom is as far from itself as no wall stands.
@@ -352,7 +352,7 @@ class EnergyNetwork(nn.Module):
         table = self.table(of_edge).unflatten(-1, (self.config.n_radial, -1))
         return EdgeWeights(edges, z, looks, table, self.nearest_nm[types][:, None], farthest[:, None])
 
-    def forward(self, positions_nm: Tensor, fabric: Fabric, made: EdgeWeights) -> Tensor:
+    def forward(self, positions_nm: Tensor, topology: Topology, made: EdgeWeights) -> Tensor:
         """Frames `(rows, n_atoms, 3)` nm -> energies `(rows, n_members)`."""
         c, dtype = self.config, made.of_atom.dtype
         x = positions_nm.transpose(0, 1)
@@ -365,26 +365,26 @@ class EnergyNetwork(nn.Module):
         steps = cast(Iterable[EnergyAttention], self.steps)
         for look, step, weights in zip(self.looks, steps, made.looks, strict=True):
             h = look(h, carried, seen, made.edges, weights)
-            new, means, q = step(h.transpose(0, 1), x, fabric.molecule.elements, fabric.groups, dense=dense)
+            new, means, q = step(h.transpose(0, 1), x, topology.molecule.elements, topology.groups, dense=dense)
             h = new.transpose(0, 1)
             # (rows, n_heads, n, 3) -> (n, rows, 3, n_heads)
             carried = (means - x[:, None]).permute(2, 0, 3, 1)
         energy = self.site(h).sum(0) + 0.5 * torch.bmm(seen.radial, made.table).sum(0)
-        energy = energy + latent_energy(q, *step.type_matrices(), fabric) @ self.latent
+        energy = energy + latent_energy(q, *step.type_matrices(), topology) @ self.latent
         # The walls: zero inside, with two derivatives.
         near = torch.relu(1.0 - seen.distance_nm / made.nearest_nm.clamp(min=_LEAST_NM))
         far = torch.relu(seen.distance_nm / made.farthest_nm - 1.0)
         return energy + (WALL * (near.pow(3) + far.pow(3)).sum(0))[:, None]
 
 
-def latent_energy(q: Tensor, phi: Tensor, psi: Tensor, fabric: Fabric) -> Tensor:
+def latent_energy(q: Tensor, phi: Tensor, psi: Tensor, topology: Topology) -> Tensor:
     """Return sum_ij rho_ij(|q_i - q_j|^2) / n^2 by head, `(rows, n_heads)`, in time linear in atoms: `q` (rows,
     n_heads, n, d) of unit length, so that s = 2 - 2 q_i.q_j; `phi` = a - 4 b and `psi` = 4 b (n_heads, n_types,
     n_types)."""
-    phi, psi = (m[:, fabric.present][:, :, fabric.present] for m in (phi, psi))
+    phi, psi = (m[:, topology.present][:, :, topology.present] for m in (phi, psi))
     b = 0.25 * psi
     a = phi + psi
-    z = fabric.one_hot.to(q.dtype)
+    z = topology.one_hot.to(q.dtype)
     sums = torch.einsum("tn,rhnd->rhtd", z, q)
     squares = torch.einsum("tn,rhnd,rhne->rhtde", z, q, q).flatten(-2)
     first = sums @ sums.transpose(-1, -2)
@@ -427,13 +427,13 @@ class SimdPotential:
     gradient `(rows, n_atoms, 3)` of their mean, by the network's weights as they are now, times `unit` and from `zero`,
     both in kJ/mol."""
 
-    def __init__(self, network: EnergyNetwork, fabric: Fabric, made: EdgeWeights, unit: float, zero: float) -> None:
-        config, n = network.config, fabric.molecule.n_atoms
+    def __init__(self, network: EnergyNetwork, topology: Topology, made: EdgeWeights, unit: float, zero: float) -> None:
+        config, n = network.config, topology.molecule.n_atoms
         self.config, self.n_atoms, self.unit, self.zero = config, n, unit, zero
         self._work: dict[tuple[int, int], npt.NDArray[Any]] = {}
         # The program reads these arrays in place.
         self._kept: list[npt.NDArray[Any]] = []
-        types = fabric.molecule.elements
+        types = topology.molecule.elements
         steps = []
         looks, attentions = cast(Iterable[Look], network.looks), cast(Iterable[EnergyAttention], network.steps)
         for look, attention in zip(looks, attentions, strict=True):
@@ -534,7 +534,7 @@ class SimdPotential:
         return _Linear(self._array(layer.weight), self._array(layer.weight.T), self._array(layer.bias))
 
 
-def simd_potential_of(network: EnergyNetwork, fabric: Fabric, made: EdgeWeights, rows: int, unit: float = 1.0,
+def simd_potential_of(network: EnergyNetwork, topology: Topology, made: EdgeWeights, rows: int, unit: float = 1.0,
                       zero: float = 0.0) -> SimdPotential | None:  # fmt: skip
     """Return the potential by SIMD, compiled for so many frames; None where it does not run so: not in single precision
     on this processor, for so many atoms that pairs change from frame to frame, or without a C++ compiler."""
@@ -544,7 +544,7 @@ def simd_potential_of(network: EnergyNetwork, fabric: Fabric, made: EdgeWeights,
         _program(network.config, _width_for(rows))
     except (CompilerError, OSError):
         return None
-    return SimdPotential(network, fabric, made, unit, zero)
+    return SimdPotential(network, topology, made, unit, zero)
 
 
 def _width_for(rows: int) -> int:
@@ -599,7 +599,7 @@ class PainetPotential(Potential):
         self.energy_offset_kj_mol = nn.Buffer(torch.zeros(()))
         self.energy_scale_kj_mol = nn.Buffer(torch.full((), 100.0))
         self._made: tuple[Molecule, GradientFn] | None = None
-        self._woven: Fabric | None = None
+        self._topology: Topology | None = None
 
     def train(self, mode: bool = True) -> PainetPotential:
         """As any module; what was made of earlier weights is forgotten."""
@@ -607,31 +607,31 @@ class PainetPotential(Potential):
         super().train(mode)
         return self
 
-    def fabric(self, molecule: Molecule) -> Fabric:
+    def topology(self, molecule: Molecule) -> Topology:
         """Return what the network needs of a molecule, made once for call after call. Raises InputError for elements
         beyond radon."""
-        if self._woven is None or self._woven.molecule is not molecule:
+        if self._topology is None or self._topology.molecule is not molecule:
             heaviest = int(molecule.elements.max())
             if heaviest >= N_TYPES:
                 raise InputError(f"PAINET has types up to atomic number {N_TYPES - 1}; this molecule holds {heaviest}.")
             with torch.inference_mode(False):
-                self._woven = Fabric.of(molecule)
-        return self._woven
+                self._topology = Topology.of(molecule)
+        return self._topology
 
     def energies(self, positions_nm: Tensor, molecule: Molecule) -> Tensor:
-        return self.members(positions_nm, self.fabric(molecule))
+        return self.members(positions_nm, self.topology(molecule))
 
-    def members(self, positions_nm: Tensor, fabric: Fabric, made: EdgeWeights | None = None) -> Tensor:
+    def members(self, positions_nm: Tensor, topology: Topology, made: EdgeWeights | None = None) -> Tensor:
         """Frames `(rows, n_atoms, 3)` nm -> the members' energies `(rows, n_members)` in kJ/mol, in float64."""
-        made = made or self.network.prepare(fabric, positions_nm)
-        energy = self.network(positions_nm, fabric, made)
+        made = made or self.network.prepare(topology, positions_nm)
+        energy = self.network(positions_nm, topology, made)
         return self.energy_offset_kj_mol.double() + self.energy_scale_kj_mol.double() * energy.double()
 
-    def member_forces(self, positions_nm: Tensor, fabric: Fabric) -> Tensor:
+    def member_forces(self, positions_nm: Tensor, topology: Topology) -> Tensor:
         """Frames `(rows, n_atoms, 3)` nm -> each member's forces `(n_members, rows, n_atoms, 3)` kJ/mol/nm."""
         with torch.inference_mode(False), torch.enable_grad():
             x = positions_nm.detach().clone().requires_grad_(True)
-            totals = self.members(x, fabric).sum(0)
+            totals = self.members(x, topology).sum(0)
             return -torch.stack([torch.autograd.grad(total, x, retain_graph=True)[0] for total in totals])
 
     def gradient(self, positions_nm: Tensor, molecule: Molecule) -> GradientFn:
@@ -641,13 +641,13 @@ class PainetPotential(Potential):
         fixed = molecule.n_atoms <= FEW_ATOMS and not self.training
         if fixed and self._made is not None and self._made[0] is molecule:
             return self._made[1]
-        fabric, simd = self.fabric(molecule), None
+        topology, simd = self.topology(molecule), None
         with torch.inference_mode(False), torch.no_grad():
-            made = self.network.prepare(fabric, positions_nm)
+            made = self.network.prepare(topology, positions_nm)
         if not self.training:
             unit, zero = float(self.energy_scale_kj_mol), float(self.energy_offset_kj_mol)
-            simd = simd_potential_of(self.network, fabric, made, len(positions_nm), unit=unit, zero=zero)
-        self._made = molecule, simd or gradient_of(lambda x: self.members(x, fabric, made))
+            simd = simd_potential_of(self.network, topology, made, len(positions_nm), unit=unit, zero=zero)
+        self._made = molecule, simd or gradient_of(lambda x: self.members(x, topology, made))
         return self._made[1]
 
     def langevin(self, x: Tensor, v: Tensor, molecule: Molecule, masses: Tensor, thermal: Tensor, draw: Tensor, *,

@@ -181,7 +181,7 @@ class Learner:
     ) -> None:
         self.model, self.reference, self.config = model, reference, config
         self.molecule = Molecule.of(reference.scene)
-        self.fabric = model.fabric(self.molecule)
+        self.topology = model.topology(self.molecule)
         self.path = samples_path(out)
         self.key = reference.scene.topology_hash
         self.samples = Samples.none(reference.scene.n_atoms)
@@ -235,7 +235,7 @@ class Learner:
         member = torch.multinomial(self._bags[k], 1, generator=generator)[:, 0]
         at = x[k].requires_grad_(True)
         with torch.autocast(at.device.type, enabled=False):
-            found = model.members(at, self.fabric).gather(1, member[:, None])[:, 0]
+            found = model.members(at, self.topology).gather(1, member[:, None])[:, 0]
             (gradient,) = torch.autograd.grad(found.sum(), at, create_graph=True)
         scale = model.energy_scale_kj_mol.double()
         wrong = (gradient + forces[k]) / (10.0 * scale)
@@ -302,7 +302,7 @@ class Learner:
     def spread(self, positions_nm: Tensor) -> Any:
         """Root mean square deviation of the members' forces from their mean, the largest of each state's atoms, `(n,)`
         in kJ/mol/nm."""
-        parts = [self.model.member_forces(part, self.fabric) for part in positions_nm.double().split(256)]
+        parts = [self.model.member_forces(part, self.topology) for part in positions_nm.double().split(256)]
         deviation = torch.cat([(p - p.mean(0)).square().sum(-1).mean(0).sqrt().amax(-1) for p in parts])
         return torch.nan_to_num(deviation, nan=0.0).numpy()
 
@@ -351,7 +351,7 @@ class Learner:
         draw = torch.rand(len(learned), members, generator=torch.Generator().manual_seed(1))
         # Each sample is somebody's.
         self._bags = ((draw < _BAG) | (draw == draw.amin(1, keepdim=True))).float()
-        self.model.network.set_walls(self._tensors[0], self.fabric)
+        self.model.network.set_walls(self._tensors[0], self.topology)
 
 
 def samples_path(out: Path) -> Path:
