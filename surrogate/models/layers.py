@@ -334,7 +334,8 @@ def with_compiled_parts(model: _Model) -> _Model:
     if isinstance(copied, Potential):
         return copied  # what it integrates is compiled as it is
     lists = [child for child in copied.children() if isinstance(child, nn.ModuleList)]
-    for parent in (copied, *lists):
+    parents: list[nn.Module] = [copied, *lists]
+    for parent in parents:
         for name, child in list(parent.named_children()):
             if type(child).forward is nn.Module.forward and child not in lists:  # it has none
                 setattr(parent, name, with_lean_parts(child))

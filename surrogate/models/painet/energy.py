@@ -331,9 +331,9 @@ class EnergyNetwork(nn.Module):
         extremes: dict[tuple[int, int, int], tuple[float, float]] = {}
         for (i, j), shell in (_all_pairs(len(elements)) | topology.shells).items():
             distance = (positions_nm[:, i] - positions_nm[:, j]).norm(dim=-1)
-            types = shell, *sorted((int(elements[i]), int(elements[j])))
-            least, most = extremes.get(types, (NO_WALL_NM, 0.0))
-            extremes[types] = min(least, float(distance.min())), max(most, float(distance.max()))
+            low, high = sorted((int(elements[i]), int(elements[j])))
+            least, most = extremes.get((shell, low, high), (NO_WALL_NM, 0.0))
+            extremes[shell, low, high] = min(least, float(distance.min())), max(most, float(distance.max()))
         for (shell, a, b), (shortest, longest) in extremes.items():
             self.nearest_nm[shell, [a, b], [b, a]] = shortest / WALL_MARGIN
             if shell < WALLED_SHELLS:
