@@ -39,13 +39,14 @@ def machine_facts() -> dict[str, Any]:
     from surrogate.training.devices import product_speed
 
     speed = product_speed()
+    products = f"fp32 {speed.fp32_gflops:.3g} GFLOP/s, bf16 {speed.ratio:.2g} times as fast"
     return {
         "name": machine_name(),
         "load_before": os.getloadavg()[0] if hasattr(os, "getloadavg") else None,
         "threads": speed.threads,
         "fp32_gflops": speed.fp32_gflops,
         "bf16_gflops": speed.bf16_gflops,
-        "about": f"{machine_name()}; {speed.describe()}",
+        "about": f"{machine_name()}; products on {speed.threads} threads: {products}",
     }
 
 

@@ -52,13 +52,6 @@ class ProductSpeed:
     def ratio(self) -> float:
         return self.bf16_gflops / self.fp32_gflops
 
-    def describe(self) -> str:
-        """Return 'products (threads: 1): fp32 70 GFLOP/s, bf16 310 GFLOP/s (4.4 times as fast)'."""
-        return (
-            f"products (threads: {self.threads}): fp32 {self.fp32_gflops:.3g} GFLOP/s, bf16 {self.bf16_gflops:.3g} "
-            f"GFLOP/s ({self.ratio:.2g} times as fast)"
-        )
-
 
 def choose_precision(wanted: str, *, suits: bool = True) -> Precision:
     """Return the precision for a CPU: as `wanted`, or under 'auto' bf16 where its products are faster. `suits`: whether

@@ -167,12 +167,6 @@ class Autoencoder(nn.Module):
             return Decoded(self.to_position(h.float()), logits)
 
 
-def pair_distances(x: Tensor) -> Tensor:
-    """Return distances `(..., n, n)` (eq. 15), differentiable on the diagonal."""
-    difference = x.unsqueeze(-2) - x.unsqueeze(-3)
-    return (difference.square().sum(-1) + 1e-12).sqrt()
-
-
 # Stage two: the latent flow model, transformer layers alternating over latents and time (Algorithms 4 and 5).
 
 Rope = tuple[Tensor, Tensor]

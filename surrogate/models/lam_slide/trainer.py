@@ -16,13 +16,7 @@ from torch.nn import functional as F
 from surrogate.data import References, StrideSampler, Survey, TrainingFrames, strides_up_to
 from surrogate.models import architecture as arch
 from surrogate.models.lam_slide import flow
-from surrogate.models.lam_slide.model import (
-    AutoencoderConfig,
-    LamSlide,
-    LamSlideConfig,
-    draw_identifiers,
-    pair_distances,
-)
+from surrogate.models.lam_slide.model import AutoencoderConfig, LamSlide, LamSlideConfig, draw_identifiers
 from surrogate.models.weights import Weights, load_weights, provenance_of, read_header, save_weights, training_domain
 from surrogate.training.devices import bf16_pays
 from surrogate.training.loop import ProgressFn, Stage, StageConfig, train_stages
@@ -44,6 +38,12 @@ def random_rotations(n: int, generator: torch.Generator) -> Tensor:
         2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y),
     ]  # fmt: skip
     return torch.stack(rows, dim=-1).reshape(n, 3, 3)
+
+
+def pair_distances(x: Tensor) -> Tensor:
+    """Return distances `(..., n, n)` (eq. 15), differentiable on the diagonal."""
+    difference = x.unsqueeze(-2) - x.unsqueeze(-3)
+    return (difference.square().sum(-1) + 1e-12).sqrt()
 
 
 def autoencoder_loss(

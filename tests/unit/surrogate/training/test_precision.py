@@ -52,7 +52,6 @@ def test_products_are_slower_in_bf16_where_the_processor_may_not_use_its_units()
     here = product_speed()
     assert here is product_speed(), "measured once"
     assert here.fp32_gflops > 0 and here.bf16_gflops > 0
-    assert "GFLOP/s" in here.describe()
     if choose_precision("auto").bf16 and "ONEDNN_MAX_CPU_ISA" not in os.environ:
         code = "from surrogate.training.devices import choose_precision as c; print(c('auto').name)"
         held_back = os.environ | {"ONEDNN_MAX_CPU_ISA": "AVX2", "PYTHONPATH": str(Path(__file__).parents[4])}
