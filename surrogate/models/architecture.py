@@ -15,7 +15,7 @@ import os
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from copy import deepcopy
-from dataclasses import asdict, dataclass, field, fields, replace
+from dataclasses import asdict, dataclass, field, replace
 from functools import cache
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
@@ -140,8 +140,7 @@ class Choice:
 
     def line(self) -> str:
         """Return it for people: 'model.longest_ps = 900.0: as far as every reference reaches'."""
-        shown = str(self.value).lower() if isinstance(self.value, bool) else self.value
-        return f"{self.key} = {shown}: {self.reason}"
+        return f"{self.key} = {json.dumps(self.value)}: {self.reason}"
 
 
 @dataclass(frozen=True)
@@ -155,12 +154,8 @@ class Settings:
 
     def tables(self) -> dict[str, dict[str, Any]]:
         """Return the tables of the configuration file that gives these settings; what is None is left out."""
-        found = {}
-        for name, value in (("model", self.model), ("training", self.training)):
-            if value is not None:
-                record = value.to_dict() if name == "model" else {f.name: getattr(value, f.name) for f in fields(value)}
-                found[name] = {key: v for key, v in record.items() if key not in self.resolved}
-        return found
+        both = {name: asdict(value) for name, value in vars(self).items() if name != "resolved" and value is not None}
+        return {name: {k: v for k, v in table.items() if k not in self.resolved} for name, table in both.items()}
 
 
 @dataclass(frozen=True)

@@ -88,11 +88,11 @@ class Learner:
             pick = torch.randint(len(one.energies), (self.rows,), generator=generator)
             member = int(torch.multinomial(self.bags[k], 1, generator=generator))
             at = one.positions_nm[pick].requires_grad_(True)
-            told = self.model.members(at, one.topology)[:, member]
-            (gradient,) = torch.autograd.grad(told.sum(), at, create_graph=True)
+            found = self.model.members(at, one.topology)[:, member]
+            (gradient,) = torch.autograd.grad(found.sum(), at, create_graph=True)
             wrong = (gradient + one.forces[pick]) / (10.0 * scale)
             force.append((wrong.square().sum(-1) + 1e-8).sqrt().mean())
-            off = (told - one.energies[pick]) / scale
+            off = (found - one.energies[pick]) / scale
             energy.append((off - off.mean()).square().mean() / at.shape[1] ** 0.5)
         of_forces, of_energies = torch.stack(force).mean(), torch.stack(energy).mean()
         return of_forces + 0.1 * of_energies, {"force": of_forces.detach(), "energy": of_energies.detach()}

@@ -24,7 +24,7 @@ import torch
 from torch import Tensor, nn
 
 from md_reference import simd as engine
-from surrogate.models.painet.model import EnergyAttention, TypeGroups, bond_paths, type_groups
+from surrogate.models.painet.model import EnergyAttention, TypeGroups, bond_paths, check_attention, type_groups
 from surrogate.models.potential import TOLERANCE, Bath, GradientFn, IntegratorConfig, Potential, at_rest, gradient_of
 from surrogate.models.propagator import Molecule
 from systems.errors import InputError
@@ -60,13 +60,10 @@ class PotentialConfig(IntegratorConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.attention not in ("auto", "linear", "dense"):
-            raise InputError(f"attention = {self.attention!r} is unknown; choose auto, linear or dense.")
+        check_attention(self, ("auto", "linear", "dense"))
         for name in SIZES:
             if getattr(self, name) < (least := 2 if name == "n_radial" else 1):
                 raise InputError(f"{name} = {getattr(self, name)} must be at least {least}.")
-        if not 0.0 < self.step < 1.0 or not 0.0 <= self.psi_limit < 1.0:
-            raise InputError(f"step = {self.step:g} and psi_limit = {self.psi_limit:g} must lie between 0 and 1.")
 
 
 # Ordered pairs of atoms, and the smooth functions of their distance that a potential sees. Pairs up to three bonds

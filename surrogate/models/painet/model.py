@@ -63,6 +63,14 @@ def linear_mean(q: Tensor, k: Tensor, v: Tensor, phi: Tensor, psi: Tensor, group
     return out[..., :-1] / out[..., -1:]
 
 
+def check_attention(config: Any, forms: tuple[str, ...]) -> None:
+    """Raise InputError for settings of the attention that are none: `attention`, `step` and `psi_limit`."""
+    if config.attention not in forms:
+        raise InputError(f"attention = {config.attention!r} is unknown; choose {', '.join(forms)}.")
+    if not 0.0 < config.step < 1.0 or not 0.0 <= config.psi_limit < 1.0:
+        raise InputError(f"step = {config.step:g} and psi_limit = {config.psi_limit:g} must lie between 0 and 1.")
+
+
 class EnergyAttention(nn.Module):
     """One latent step: h <- (1 - eta) h + eta W concat_heads(mean of values), with learned Q, K, V.
 
@@ -247,13 +255,10 @@ class PainetConfig(ModelConfig):
     friction_per_ps: float = 1.0
 
     def __post_init__(self) -> None:
-        if self.attention not in ("linear", "dense", "none"):
-            raise InputError(f"attention = {self.attention!r} is unknown; choose linear, dense or none.")
+        check_attention(self, ("linear", "dense", "none"))
         for name in ("n_new", "frame_stride", "n_decoder_layers"):
             if getattr(self, name) < 1:
                 raise InputError(f"{name} = {getattr(self, name)} must be at least 1.")
-        if not 0.0 < self.step < 1.0 or not 0.0 <= self.psi_limit < 1.0:
-            raise InputError(f"step = {self.step:g} and psi_limit = {self.psi_limit:g} must lie between 0 and 1.")
 
     @property
     def chunk_ps(self) -> float:
@@ -279,7 +284,7 @@ class Painet(Propagator):
     """X0, V0 -> X(1..T) and V(T), equivariant to rotations, reflections, translations and atom order.
 
     Embeddings start from invariants of the state: element, speed, distance to the centre of mass and the angle between
-    the two. A learned vector per frame tells the decoder which one it decodes. Velocities are learned in units of
+    the two. A learned vector per frame says which one is decoded. Velocities are learned in units of
     `velocity_scale_nm_ps`; `reach` (2,) is what positions and velocities change by over a chunk, in the model's units:
     both are measured on the training frames. The centre of mass moves on at its velocity, exactly: only the motion
     about it is learned.

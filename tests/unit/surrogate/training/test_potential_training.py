@@ -43,7 +43,7 @@ class Answers:
 
 
 class Springs:
-    """A reference that is quickly told: springs between all atoms at most two bonds apart."""
+    """A cheap reference: springs between all atoms at most two bonds apart."""
 
     def __init__(self, *, silent: bool = False) -> None:
         self.scene: Scene = scene_from_smiles("O")
@@ -203,7 +203,7 @@ def test_frames_may_move_as_far_as_those_of_hot_md() -> None:
     both = jumps(cold, hot)
     # Runs end where they end: from the last cold frame to the first hot one nothing moved.
     assert both == pytest.approx((jumps(cold)[0], jumps(hot)[1])) and both[1] > 5.0 * jumps(cold)[1]
-    # Turned about only, nothing changes but for rounding, which is no more than is told.
+    # Turned about only, nothing changes but for rounding, which is no more than is stated.
     assert jumps(np.stack([Rotation.random(rng=k).apply(cold[0]) for k in range(9)]))[1] < 1e-9
 
 

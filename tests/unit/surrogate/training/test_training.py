@@ -83,20 +83,20 @@ def test_training_goes_on_from_weights(tmp_path: Path, harmonic_frames: Training
 
 
 def test_weights_tell_each_trajectory_of_their_ancestors_once(small_weights: Weights) -> None:
-    def told(*files: str, **more: Any) -> dict[str, Any]:
+    def sources(*files: str, **more: Any) -> dict[str, Any]:
         return {"sources": [{"file": name, "sha256": name} for name in files], **more}
 
-    eldest = {"hash": "0", **told("a", "b"), "spent_s": 1.0}
-    start = replace(small_weights, provenance=told("b", "c", **{"from": eldest, "spent_s": 2.0}), hash="1")
-    made = provenance_of(told("c", "d"), {}, start)
+    eldest = {"hash": "0", **sources("a", "b"), "spent_s": 1.0}
+    start = replace(small_weights, provenance=sources("b", "c", **{"from": eldest, "spent_s": 2.0}), hash="1")
+    made = provenance_of(sources("c", "d"), {}, start)
     assert [source["file"] for source in made["sources"]] == ["c", "d"]
     assert made["from"] == {
         "hash": "1",
-        **told("b"),
+        **sources("b"),
         "spent_s": 2.0,
-        "from": {"hash": "0", **told("a"), "spent_s": 1.0},
+        "from": {"hash": "0", **sources("a"), "spent_s": 1.0},
     }
-    assert start.provenance["sources"] == told("b", "c")["sources"], "which stay as they are"
+    assert start.provenance["sources"] == sources("b", "c")["sources"], "which stay as they are"
 
 
 def test_training_goes_on_only_from_weights_that_fit(tmp_path: Path, harmonic_frames: TrainingFrames,

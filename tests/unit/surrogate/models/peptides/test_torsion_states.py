@@ -110,7 +110,7 @@ def test_numbers_count_from_the_middle_of_the_state_and_come_back() -> None:
 
 
 def test_the_loss_is_the_negative_log_likelihood_of_what_was_done() -> None:
-    """Odds are set by hand: of two states and of three, one residue without any."""
+    """Probabilities are set by hand: of two states and of three, one residue without any."""
     jumps, counts = StateJumps(4, 2), _counts([2, 3], [])
     with torch.no_grad():
         jumps.logits.bias.zero_()
@@ -125,7 +125,7 @@ def test_the_loss_is_the_negative_log_likelihood_of_what_was_done() -> None:
     crosses = 1.0 / (1.0 + np.exp(-(1.0 + 0.5 * 2.0)))
     turns = np.exp(2.0) / (np.exp(-1.0) + np.exp(2.0) + 1.0)
     assert float(found) == pytest.approx((-np.log(crosses) - np.log(turns)) / 2.0, rel=1e-5)
-    # What the neighbours' types say comes on top, before and after told apart: this residue's are both of type 1.
+    # What the neighbours' types say comes on top, before and after: this residue's are both of type 1.
     with torch.no_grad():
         jumps.beside_change[1, 1, 0, 0, 1] = -0.2
         jumps.beside_change[:, 0] = 5.0
