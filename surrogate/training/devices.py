@@ -40,19 +40,6 @@ class Precision:
         return "bf16" if self.bf16 else "fp32"
 
 
-@dataclass(frozen=True)
-class ProductSpeed:
-    """Speed of matrix products on this processor, a batch through a layer, in GFLOP/s."""
-
-    fp32_gflops: float
-    bf16_gflops: float
-    threads: int
-
-    @property
-    def ratio(self) -> float:
-        return self.bf16_gflops / self.fp32_gflops
-
-
 def choose_precision(wanted: str, *, suits: bool = True) -> Precision:
     """Return the precision for a CPU: as `wanted`, or under 'auto' bf16 where its products are faster. `suits`: whether
     bf16 suits the model at all. Raises InputError for an unknown name, and for bf16 where it does not."""
@@ -64,8 +51,8 @@ def choose_precision(wanted: str, *, suits: bool = True) -> Precision:
         return Precision(wanted == "bf16", "as asked for")
     if not suits:
         return Precision(False, "this model is exact in fp32 alone")
-    speed = product_speed()
-    return Precision(speed.ratio >= _PAYS, f"products in bf16 are {speed.ratio:.2g} times as fast as in fp32 here")
+    fp32, bf16 = product_speed()
+    return Precision(bf16 >= _PAYS * fp32, f"products in bf16 are {bf16 / fp32:.2g} times as fast as in fp32 here")
 
 
 def bf16_pays(device_type: str) -> bool:
@@ -76,8 +63,9 @@ def bf16_pays(device_type: str) -> bool:
 
 
 @cache
-def product_speed() -> ProductSpeed:
-    """Measure products in both precisions by turns, some ms of each; the best of each counts."""
+def product_speed() -> tuple[float, float]:
+    """Return the speed of products of a batch and a layer in fp32 and in bf16, GFLOP/s: the best of some ms each, by
+    turns."""
     rows, n_in, n_out = _PRODUCT
     pairs = {
         dtype: (torch.ones(rows, n_in, dtype=dtype), torch.ones(n_out, n_in, dtype=dtype))
@@ -91,7 +79,7 @@ def product_speed() -> ProductSpeed:
                 torch.nn.functional.linear(x, weight)
                 best[dtype] = min(best[dtype], time.perf_counter() - started)
     gflop = 2e-9 * rows * n_in * n_out
-    return ProductSpeed(gflop / best[torch.float32], gflop / best[torch.bfloat16], torch.get_num_threads())
+    return gflop / best[torch.float32], gflop / best[torch.bfloat16]
 
 
 @contextmanager

@@ -16,18 +16,17 @@ from surrogate.models.weights import Weights, load_weights
 from surrogate.sampling.chunks import ChunkSampler
 from surrogate.sampling.runner import RolloutConfig, rollout
 from surrogate.training import devices as precision
-from surrogate.training.devices import ProductSpeed, bf16_pays, choose_precision, product_speed
+from surrogate.training.devices import bf16_pays, choose_precision, product_speed
 from surrogate.verbs.info import describe_file
 from systems.errors import InputError
 from systems.scene import Scene
 from systems.trajectory.checkpoint import checkpoint_path, read_checkpoint
 from systems.trajectory.codec import open_trajectory
 
-FAST = ProductSpeed(70.0, 280.0, 1)
-SLOW = ProductSpeed(70.0, 14.0, 1)
+FAST, SLOW = (70.0, 280.0), (70.0, 14.0)
 
 
-def processor(monkeypatch: pytest.MonkeyPatch, speed: ProductSpeed) -> None:
+def processor(monkeypatch: pytest.MonkeyPatch, speed: tuple[float, float]) -> None:
     monkeypatch.setattr(precision, "product_speed", lambda: speed)
 
 
@@ -51,7 +50,7 @@ def test_bf16_is_chosen_where_its_products_are_faster(monkeypatch: pytest.Monkey
 def test_products_are_slower_in_bf16_where_the_processor_may_not_use_its_units() -> None:
     here = product_speed()
     assert here is product_speed(), "measured once"
-    assert here.fp32_gflops > 0 and here.bf16_gflops > 0
+    assert min(here) > 0.0
     if choose_precision("auto").bf16 and "ONEDNN_MAX_CPU_ISA" not in os.environ:
         code = "from surrogate.training.devices import choose_precision as c; print(c('auto').name)"
         held_back = os.environ | {"ONEDNN_MAX_CPU_ISA": "AVX2", "PYTHONPATH": str(Path(__file__).parents[4])}
