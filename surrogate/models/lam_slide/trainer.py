@@ -283,7 +283,8 @@ def _resolve(frames: TrainingFrames, model_config: LamSlideConfig, config: Train
 
 def _strides(frames: TrainingFrames, model_config: LamSlideConfig) -> tuple[int, ...]:
     """Return the strides that windows are drawn with. Raises InputError for lags that the frames do not have."""
-    lags, strides = model_config.approximator.lag_range_ps, (1,)
+    lags = model_config.approximator.lag_range_ps
+    strides: tuple[int, ...] = (1,)
     if lags is not None:
         if not np.isclose(lags[0], frames.lag_ps, rtol=1e-4):
             raise InputError(f"the model's lags begin at {lags[0]:g} ps, frames of {frames.scene.name} are saved every "
