@@ -69,19 +69,18 @@ def cost_error(
 
 
 def choose_settings(weights: Weights, sweep: Sweep) -> list[Setting]:
-    """Return the settings to run. Without solvers those that take a batch at once.
+    """Return the settings to run, of all solvers where none is named.
 
     Where neither precisions nor batches are given, the usual solver at the usual steps is run in both precisions, alone
     and in a batch; with `compiled` also compiled. Raises InputError for a solver that the weights do not know.
     """
-    from surrogate.models.lam_slide.flow import ADAPTIVE
     from surrogate.training.devices import choose_precision
 
     known = weights.model.solvers
     unknown = [name for name in sweep.solvers or () if name not in known]
     if unknown:
         raise InputError(f"{weights.path.name} knows no solver {unknown[0]!r}; choose {', '.join(known) or 'none'}.")
-    chosen: list[str | None] = [*(sweep.solvers or [name for name in known if name not in ADAPTIVE])] or [None]
+    chosen: list[str | None] = [*(sweep.solvers or known)] or [None]
     own = weights.model.usual_steps
     numbers = (sweep.steps or STEPS) if known else (own,)
     axes = chosen, numbers, sweep.precisions or ("auto",), sweep.batches or (USUAL_BATCH,)

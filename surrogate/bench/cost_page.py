@@ -15,7 +15,7 @@ from systems.files.whole_file import create_whole
 
 # A rollout with fewer whole molecules is drawn hollow, and nobody should count its error.
 SOUND_PERCENT = 99.0
-_COLOURS = {"multistep": "#1f77b4", "fitted": "#d62728", "euler": "#7f7f7f", "dopri5": "#9467bd"}
+_COLOURS = {"multistep": "#1f77b4", "fitted": "#d62728", "euler": "#7f7f7f"}
 # Of these the shorter parts of a rollout are drawn, too.
 _DRAWN_STEPS = (4, 10)
 _MD_STYLES = (":", "--", "-")

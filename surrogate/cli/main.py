@@ -258,10 +258,7 @@ def train(
     if out is None:
         raise usage_error("train needs --out: Weights to write, .safetensors.")
     written = sm.train(references, out, options=options)
-    from surrogate.training.devices import is_first_process
-
-    if is_first_process():
-        print_written([written], as_json, options.quiet)
+    print_written([written], as_json, options.quiet)
 
 
 @app.command()

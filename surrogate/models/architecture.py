@@ -12,11 +12,10 @@ from __future__ import annotations
 
 import json
 import os
-import tomllib
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from copy import deepcopy
-from dataclasses import asdict, dataclass, field, fields, replace
+from dataclasses import asdict, dataclass, field, replace
 from functools import cache
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
@@ -54,10 +53,10 @@ class ModelConfig:
 
 
 def toml_text(record: dict[str, Any], table: str = "") -> str:
-    """Return a record of texts, numbers, booleans, and lists and tables of these as TOML, without values that are None;
-    tables in lists are written in one line."""
+    """Return a record of texts, numbers, booleans, lists of these, and tables as TOML, without values that are None."""
     kept = {key: value for key, value in record.items() if value is not None}
-    lines = [f"{key} = {_inline(value)}" for key, value in kept.items() if not isinstance(value, dict)]
+    # JSON's texts, booleans, finite numbers and lists are TOML's.
+    lines = [f"{key} = {json.dumps(value)}" for key, value in kept.items() if not isinstance(value, dict)]
     text = "".join(f"{line}\n" for line in lines)
     if table and (lines or not kept):
         text = f"[{table}]\n{text}"
@@ -67,39 +66,21 @@ def toml_text(record: dict[str, Any], table: str = "") -> str:
     return text
 
 
-def _inline(value: Any) -> str:
-    if isinstance(value, dict):
-        pairs = [f"{key} = {_inline(each)}" for key, each in value.items() if each is not None]
-        return "{" + ", ".join(pairs) + "}"
-    if isinstance(value, list | tuple):
-        return "[" + ", ".join(_inline(each) for each in value) + "]"
-    # JSON's texts, booleans and finite numbers are TOML's.
-    return json.dumps(value)
-
-
-@dataclass(frozen=True)
-class Suitability:
-    """How well an architecture suits references: of several that do, the one of the highest `rank` is trained."""
-
-    rank: int
-    reason: str
-
-
 @dataclass(frozen=True)
 class Architecture:
     """One kind of surrogate, under the name that weights files and `arch` have for it.
 
     `config` builds a configuration from a record (InputError for unknown keys), `model` the network from that.
     `trainer` returns its `Trainer`; rollouts do not call it, so that it may import what only training needs.
-    `suits` returns how well the architecture suits references, None where it does not: it is trained when it is asked
-    for by name.
+    `suits` returns a rank and a reason for architectures that are trained on such references without being named (of
+    several the one of the highest rank), else None.
     """
 
     name: str
     config: Callable[[dict[str, Any]], Any]
     model: Callable[[Any], Propagator]
     trainer: Callable[[], Any]
-    suits: Callable[[Survey], Suitability | None] = lambda survey: None
+    suits: Callable[[Survey], tuple[int, str] | None] = lambda survey: None
 
 
 # Settings of trainings that the command line decides.
@@ -141,8 +122,7 @@ class TrainingRequest:
 
     def settings(self, kind: type[T], asked: dict[str, Any] | None = None) -> T:
         """Return the training's settings `kind`: the table `training` and what was `asked` for on the command line
-        (budget, steps, seed and device if None), which the table may not hold as well. Raises InputError for unknown
-        keys."""
+        (`RESOLVED` if None), which the table may not hold as well. Raises InputError for unknown keys."""
         asked = {name: getattr(self, name) for name in RESOLVED} if asked is None else asked
         if twice := sorted(asked.keys() & self.training):
             raise InputError(f"training.{twice[0]} is set on the command line, not in the configuration file.")
@@ -160,17 +140,13 @@ class Choice:
 
     def line(self) -> str:
         """Return it for people: 'model.longest_ps = 900.0: as far as every reference reaches'."""
-        shown = str(self.value).lower() if isinstance(self.value, bool) else self.value
-        return f"{self.key} = {shown}: {self.reason}"
+        return f"{self.key} = {json.dumps(self.value)}: {self.reason}"
 
 
 @dataclass(frozen=True)
 class Settings:
-    """The configuration of a model and of its training, as they will be used: frozen dataclasses.
-
-    `resolved`: names of those of the training that the command line decides (budget, seed, ...), and of those of the
-    model that training finds; neither belongs into a configuration file.
-    """
+    """The configuration of a model and of its training, as they will be used: frozen dataclasses. `resolved`: names of
+    what the command line decides (budget, seed, ...) and training finds, which no configuration file holds."""
 
     model: Any
     training: Any
@@ -178,12 +154,8 @@ class Settings:
 
     def tables(self) -> dict[str, dict[str, Any]]:
         """Return the tables of the configuration file that gives these settings; what is None is left out."""
-        found = {}
-        for name, value in (("model", self.model), ("training", self.training)):
-            if value is not None:
-                record = value.to_dict() if name == "model" else {f.name: getattr(value, f.name) for f in fields(value)}
-                found[name] = {key: v for key, v in record.items() if key not in self.resolved}
-        return found
+        both = {name: asdict(value) for name, value in vars(self).items() if name != "resolved" and value is not None}
+        return {name: {k: v for k, v in table.items() if k not in self.resolved} for name, table in both.items()}
 
 
 @dataclass(frozen=True)
@@ -205,15 +177,17 @@ class Trainer(ABC):
 
     def check(self, request: TrainingRequest) -> None:
         """Raise InputError for what was asked for and means nothing here; no reference has been read yet."""
-        if self.fitted:
-            given = {"`budget_s`": request.budget_s, "`steps`": request.steps,
-                     "`config`": request.model or request.training or None}  # fmt: skip
-            _refuse(request.arch, [k for k, v in given.items() if v is not None], "is fitted in one go")
-        elif request.budget_s is None and request.steps is None:
+        asked = {
+            "`budget_s`": request.budget_s is not None and self.fitted,
+            "`steps`": request.steps is not None and self.fitted,
+            "`config`": bool(request.model or request.training) and self.fitted,
+            "`start_from`": request.start_from is not None and not self.goes_on,
+            "`longest_lag_ps`": request.longest_lag_ps is not None and not self.learns_lags,
+        }
+        if meaningless := [name for name, is_given in asked.items() if is_given]:
+            raise InputError(f"{request.arch} takes no {', '.join(meaningless)}; leave it out.")
+        if not self.fitted and request.budget_s is None and request.steps is None:
             raise InputError("say how long to train: `budget_s='30min'` or `steps=10000`.")
-        unknown = {"`start_from`": request.start_from is not None and not self.goes_on,
-                   "`longest_lag_ps`": request.longest_lag_ps is not None and not self.learns_lags}  # fmt: skip
-        _refuse(request.arch, [k for k, is_given in unknown.items() if is_given], "does not know it")
         if request.start_from is not None and (request.longest_lag_ps is not None or request.model):
             which = "[model] of `config`" if request.model else "`longest_lag_ps`"
             raise InputError(f"`start_from` takes the configuration of its weights; leave {which} out.")
@@ -232,13 +206,18 @@ class Trainer(ABC):
         """Read the frames. Raises InputError where they do not suit the settings."""
 
 
-def _refuse(arch: str, options: list[str], why: str) -> None:
-    if options:
-        raise InputError(f"{', '.join(options)}: {arch} {why}; leave it out.")
-
-
-# Entry points, loaded when they are used.
 GROUP = "surromd.architectures"
+# Those of this package, as entry points name them; loaded when they are used.
+_OURS = {
+    "lam-slide": "surrogate.models.lam_slide.trainer:LAM_SLIDE",
+    "lam-slide-peptides": "surrogate.models.peptides.trainer:PEPTIDES",
+    "painet": "surrogate.models.painet.model:PAINET",
+    "painet-potential": "surrogate.models.painet.potential_trainer:PAINET_POTENTIAL",
+    "egnn": "surrogate.models.painet.model:EGNN",
+    "frozen": "surrogate.models.baselines:FROZEN",
+    "resampling": "surrogate.models.baselines:RESAMPLING",
+    "normal-modes": "surrogate.models.baselines:NORMAL_MODES",
+}
 
 
 def names() -> list[str]:
@@ -265,11 +244,10 @@ def architecture(name: str) -> Architecture:
 @cache
 def _found() -> dict[str, EntryPoint]:
     """Return the entry points by name. Raises InputError where two packages offer different ones under one name."""
-    own = _own()
-    found = {point.name: point for point in own}
+    found = {name: EntryPoint(name, value, GROUP) for name, value in _OURS.items()}
     for point in entry_points(group=GROUP):
-        if own and point.dist is not None and point.dist.name == "surromd":
-            continue  # a source tree's own stand for those of an installed version
+        if point.dist is not None and point.dist.name == "surromd":
+            continue  # left by the installation of an earlier version
         known = found.setdefault(point.name, point)
         if known.value != point.value:
             raise InputError(
@@ -277,18 +255,6 @@ def _found() -> dict[str, EntryPoint]:
                 "uninstall one."
             )
     return found
-
-
-def _own() -> list[EntryPoint]:
-    """Return surromd's own entry points of a source tree, which may be used without being installed."""
-    project = Path(__file__).resolve().parents[2] / "pyproject.toml"
-    if not project.is_file():
-        return []
-    record = tomllib.loads(project.read_text("utf-8")).get("project", {})
-    if record.get("name") != "surromd":
-        return []
-    declared = record.get("entry-points", {}).get(GROUP, {})
-    return [EntryPoint(name, value, GROUP) for name, value in declared.items()]
 
 
 _FOLDER = Path(__file__).parents[1] / "pretrained"

@@ -3,8 +3,7 @@
     class TestMyModel(PropagatorContract):
         def make(self, n_atoms: int) -> Propagator: ...
 
-pytest runs every `test_` method; each raises AssertionError with what is wrong. A claim that a model does not make
-(`equivariant`, `uses_noise`, ...) is switched off in the subclass, where a reader sees it.
+A claim that a model does not make (`equivariant`, `uses_noise`, ...) is switched off in the subclass.
 """
 
 from __future__ import annotations

@@ -181,7 +181,7 @@ _FEW = 8
 def with_lean_parts(model: _Model) -> _Model:
     """Return a copy for inference on a CPU whose transformer blocks, and layers in bf16, are the lean ones; the model
     itself where it has neither."""
-    if not any(map(_has_lean_form, model.modules())):
+    if not any(isinstance(m, ParallelBlock | CrossAttentionBlock) or _is_bf16(m) for m in model.modules()):
         return model
     copied = copy.deepcopy(model)
     for parent in list(copied.modules()):
@@ -192,15 +192,13 @@ def with_lean_parts(model: _Model) -> _Model:
                 setattr(parent, name, LeanCrossBlock(child))
             elif isinstance(child, nn.GELU):
                 setattr(parent, name, _Gelu())
-            elif isinstance(child, nn.Linear) and _has_lean_form(child):
+            elif isinstance(child, nn.Linear) and _is_bf16(child):
                 setattr(parent, name, PackedLinear(child.weight, child.bias))
     return copied
 
 
-def _has_lean_form(module: nn.Module) -> bool:
-    if isinstance(module, nn.Linear):
-        return module.weight.dtype == torch.bfloat16
-    return isinstance(module, ParallelBlock | CrossAttentionBlock)
+def _is_bf16(module: nn.Module) -> bool:
+    return isinstance(module, nn.Linear) and module.weight.dtype == torch.bfloat16
 
 
 class PackedLinear(nn.Module):
@@ -212,7 +210,9 @@ class PackedLinear(nn.Module):
         super().__init__()
         self.out_features, self.in_features = weight.shape
         self.dtype = weight.dtype
-        self.packed = weight.dtype == torch.bfloat16 and _can_pack()
+        # Builds of torch for ARM and some others do not multiply packed weights.
+        can_pack = torch.backends.mkldnn.is_available() and hasattr(torch.ops.mkldnn, "_reorder_linear_weight")
+        self.packed = can_pack and weight.dtype == torch.bfloat16
         weight = weight.detach().contiguous()
         packed = torch.ops.mkldnn._reorder_linear_weight(weight, _ROWS) if self.packed else weight
         self.weight = nn.Buffer(packed, persistent=False)
@@ -319,11 +319,6 @@ class LeanCrossBlock(nn.Module):
 class _Gelu(nn.Module):
     def forward(self, x: Tensor) -> Tensor:
         return gelu(x)
-
-
-def _can_pack() -> bool:
-    """Whether this build of torch multiplies packed weights: those for ARM and some others do not."""
-    return torch.backends.mkldnn.is_available() and hasattr(torch.ops.mkldnn, "_reorder_linear_weight")
 
 
 def with_compiled_parts(model: _Model) -> _Model:

@@ -84,14 +84,13 @@ class Potential(Propagator):
     """Energies and forces: a learned potential, which is a propagator by the MD that is run on it.
 
     A subclass sets `arch` and `config` (an `IntegratorConfig` or what extends it) and implements `energies`, a
-    differentiable function of positions; forces are its exact gradient, so that energy is kept. Masses, rigid bonds to
-    hydrogen, thermostat and chunks are here: Langevin middle (Zhang 2019) or velocity Verlet, in double precision, with
-    the centre of mass at rest. It may override `gradient` where it has a faster one than torch's, and `featurise`,
-    whose `own` is then a `RigidBonds` or None.
+    differentiable function of positions; forces are its exact gradient. Masses, rigid bonds to hydrogen, thermostat and
+    chunks are here: Langevin middle (Zhang 2019) or velocity Verlet, in double precision, with the centre of mass at
+    rest. It may override `gradient` where it has a faster one than torch's, and `featurise`, whose `own` is then a
+    `RigidBonds` or None.
 
-    What holds for every potential, beside what holds for every propagator (`surrogate.models.conformance`): the energy
-    does not depend on where the molecule lies and how it is turned, is finite and smooth wherever MD may lead it, and
-    does not depend on the frames evaluated beside it.
+    Beside what holds for every propagator (`surrogate.models.conformance`), the energy does not depend on where the
+    molecule lies, how it is turned and what is evaluated beside it, and is finite and smooth wherever MD may lead it.
     """
 
     config: Any
@@ -273,9 +272,8 @@ def gradient_of(energy: EnergyFn) -> GradientFn:
 
 
 # Bonds to hydrogen that stay rigid while a molecule is integrated: CCMA (Eastman and Pande, J. Chem. Theory Comput. 6,
-# 434 (2010)), for many replicas at once. What a correction along one bond does to the others hangs on masses and on the
-# angles between bonds that share an atom, which hardly change. So one matrix, of the molecule at rest, turns deviations
-# of all bonds into corrections of all; a few rounds meet the tolerance.
+# 434 (2010)), for many replicas at once. One matrix, of the molecule at rest, turns deviations of all bonds into
+# corrections of all: it depends on masses and on angles between bonds that share an atom, which hardly change.
 
 
 class RigidBonds(NamedTuple):
@@ -306,28 +304,27 @@ class RigidBonds(NamedTuple):
     def place(self, free_nm: Tensor, before_nm: Tensor) -> Tensor:
         """Return positions `(rows, n_atoms, 3)` nearest to `free_nm` at which bonds have their lengths, moved along
         the bonds of `before_nm`. Rows that cannot be mended are returned as far as they came."""
-        along, x = self._along(before_nm), free_nm
-        for _ in range(ROUNDS):
-            off = 0.5 * (self.length2 - self._along(x).square().sum(-1))
-            if not bool((off.abs() > TOLERANCE * self.length2).any()):
-                break
-            x = self._moved(x, along, off)
-        return x
+
+        def off(bonds: Tensor) -> Tensor:
+            return 0.5 * (self.length2 - bonds.square().sum(-1))
+
+        return self._solved(free_nm, self._bonds(before_nm), off, TOLERANCE * self.length2)
 
     def project(self, v: Tensor, x_nm: Tensor) -> Tensor:
         """Return velocities `(rows, n_atoms, 3)` without those along bonds, at positions `x_nm`."""
-        along = self._along(x_nm)
-        for _ in range(ROUNDS):
-            off = -(along * self._along(v)).sum(-1)
-            if not bool((off.abs() > TOLERANCE).any()):
-                break
-            v = self._moved(v, along, off)
-        return v
+        along = self._bonds(x_nm)
+        return self._solved(v, along, lambda apart: -(along * apart).sum(-1), TOLERANCE)
 
-    def _along(self, x: Tensor) -> Tensor:
+    def _bonds(self, x: Tensor) -> Tensor:
         return x[:, self.first] - x[:, self.second]
 
-    def _moved(self, x: Tensor, along: Tensor, off: Tensor) -> Tensor:
-        step = (off @ self.inverse)[..., None] * along
-        x = x.index_add(1, self.first, step * self.per_mass[:, :1])
-        return x.index_add(1, self.second, -step * self.per_mass[:, 1:])
+    def _solved(self, x: Tensor, along: Tensor, off: Callable[[Tensor], Tensor], tolerance: Tensor | float) -> Tensor:
+        """Move ends of bonds `along` (rows, k, 3) until what is `off` by bonds is within the tolerance."""
+        for _ in range(ROUNDS):
+            wrong = off(self._bonds(x))
+            if not bool((wrong.abs() > tolerance).any()):
+                break
+            step = (wrong @ self.inverse)[..., None] * along
+            x = x.index_add(1, self.first, step * self.per_mass[:, :1])
+            x = x.index_add(1, self.second, -step * self.per_mass[:, 1:])
+        return x

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar
@@ -73,8 +74,8 @@ class Propagator(nn.Module, ABC):
     A subclass sets `arch` and `config` (an `architecture.ModelConfig`, which the weights file keeps) and implements
     `n_new`, `noise_shape` and `next_chunk`; it sets `n_conditioning` where a chunk follows from more than one frame,
     `solvers` and `usual_steps` where it integrates a flow, `float32_layers` where it may be evaluated in bf16, and
-    overrides `featurise` where it looks at more than elements, masses and bonds, `at_lag` where it was trained for
-    several lags. `Architecture` says how it is trained.
+    overrides `featurise` where it looks at more than elements, masses and bonds. One trained for several lags sets
+    `lag_range_ps` and `lag_ps`. `Architecture` says how it is trained.
 
     What holds for every model, and what `surrogate.models.conformance` tests:
 
@@ -93,6 +94,9 @@ class Propagator(nn.Module, ABC):
     # Solvers that `next_chunk` knows, the default first, and its usual steps; none of a model of one evaluation.
     solvers: tuple[str, ...] = ()
     usual_steps: int = 10
+    # Shortest and longest spacing of frames of a model trained for several, and that of the frames that it returns.
+    lag_range_ps: tuple[float, float] | None = None
+    lag_ps: float | None = None
     # Prefixes of the names of layers that stay in float32 when the others are evaluated in bf16; None where all do.
     float32_layers: tuple[str, ...] | None = None
 
@@ -108,9 +112,15 @@ class Propagator(nn.Module, ABC):
         return Molecule.of(scene)
 
     def at_lag(self, lag_ps: float) -> Self:
-        """Return this model, its weights shared, with frames `lag_ps` apart. Raises InputError for a lag that it was
-        not trained for; models of one lag are not asked."""
-        raise InputError(f"{self.arch} was trained for one spacing of frames and takes no lag.")
+        """Return this model, its weights shared, with frames `lag_ps` apart. Raises InputError outside its range."""
+        if self.lag_range_ps is None:
+            raise InputError(f"{self.arch} was trained for one spacing of frames and takes no lag.")
+        low, high = self.lag_range_ps
+        if not low * (1 - 1e-6) <= lag_ps <= high * (1 + 1e-6):
+            raise InputError(f"a lag of {lag_ps:g} ps is none that this model was trained for.")
+        model = copy.copy(self)
+        model.lag_ps = lag_ps
+        return model
 
     @abstractmethod
     def noise_shape(self, n_atoms: int) -> tuple[int, ...]:
@@ -118,15 +128,9 @@ class Propagator(nn.Module, ABC):
 
     @abstractmethod
     def next_chunk(
-        self,
-        last_frames_nm: Tensor,
-        molecule: Molecule,
-        noise: Tensor,
-        *,
-        solver_steps: int = 1,
-        solver: str | None = None,
-        last_velocities_nm_ps: Tensor | None = None,
-    ) -> Chunk:
+        self, last_frames_nm: Tensor, molecule: Molecule, noise: Tensor, *, solver_steps: int = 1,
+        solver: str | None = None, last_velocities_nm_ps: Tensor | None = None,
+    ) -> Chunk:  # fmt: skip
         """Return the frames that follow.
 
         Args:

@@ -17,7 +17,7 @@ from surrogate.models.architecture import architecture
 from surrogate.models.propagator import Propagator
 from surrogate.training.loop import save_tensors, tensor_checksum
 from systems.chemistry.validity import geometry_from_frames, limits_from_frames
-from systems.errors import InputError, SurromdError, UnknownNameError, WeightsError, first_line
+from systems.errors import InputError, SurromdError, WeightsError, first_line
 from systems.files.outside import UNREADABLE
 from systems.files.schema import built, parsed
 from systems.scene import Scene
@@ -30,9 +30,8 @@ _LEAST_SIZE = 1_000_000
 @dataclass(frozen=True)
 class TrainingDomain:
     """The training domain of weights. `scene` is the template: atom k of the model is its atom k, and canonical
-    frames are superposed on its positions. `conditions` are those of the reference (force field, temperature_k, ...);
-    `geometry` is what its frames say of valid ones (systems.chemistry.validity.Geometry as a dictionary), `limits` how
-    far they go beyond that (systems.chemistry.validity.Limits; None where there are none).
+    frames are superposed on its positions. `conditions`: of the reference (force field, temperature_k, ...);
+    `geometry` and `limits` of its frames, as dictionaries (systems.chemistry.validity.Geometry and Limits).
 
     `lag_ps`: between frames, the shortest where the model takes a lag; `jumps` are then rows (lag, least and greatest
     jump) that stand for those of `limits` at each lag. `further`: the domains of other molecules trained on.
@@ -66,14 +65,12 @@ class TrainingDomain:
 
     def describe(self) -> str:
         """One line for people: 'alanine-dipeptide (C6H12N2O2, 22 atoms), ff14SB/obc2, 300 K, frames 1 ps apart'."""
-        c = self.conditions
+        c, names = self.conditions, [domain.scene.name for domain in self.members]
         lags = f"{self.lag_ps:g}" + (f" to {self.longest_lag_ps:g}" if self.jumps else "")
         what = f"{self.scene.name} ({self.scene.formula}, {self.scene.n_atoms} atoms)"
         if self.further:
-            names = [domain.scene.name for domain in self.members]
-            listed = ", ".join(names[:6]) + (f" and {len(names) - 6} more" if len(names) > 6 else "")
-            most = max(domain.scene.n_atoms for domain in self.members)
-            what = f"{len(names)} molecules of up to {most} atoms ({listed})"
+            more = f" and {len(names) - 6} more" if len(names) > 6 else ""
+            what = f"{len(names)} molecules ({', '.join(names[:6])}{more})"
         what += " and molecules like them" if self.transferable else ""
         return f"{what}, {c.get('force_field')}/{c.get('solvent')}, {c.get('temperature_k')} K, frames {lags} ps apart"
 
@@ -114,12 +111,8 @@ def save_weights(
     path: str | Path, model: Propagator, domain: TrainingDomain, provenance: dict[str, Any], *, half: bool = False
 ) -> None:
     """Write weights whole or not at all; `half` rounds them to float16, half the size, for shipping."""
-    header = {
-        "arch": model.arch,
-        "config": model.config.to_dict(),
-        "domain": domain.to_dict(),
-        "provenance": provenance,
-    }
+    header = {"arch": model.arch, "config": model.config.to_dict(), "domain": domain.to_dict(),
+              "provenance": provenance}  # fmt: skip
     dtype = torch.float16 if half else torch.float32
     tensors = {k: v.to(dtype) for k, v in model.state_dict().items()}
     save_tensors(Path(path), "surromd", header, tensors, format=FORMAT)
@@ -138,16 +131,13 @@ def _header(path: Path) -> tuple[Header, dict[str, str]]:
     try:
         with safe_open(path, framework="pt") as handle:
             metadata = dict(handle.metadata() or {})
-    except (SafetensorError, OSError, ValueError) as error:
-        raise WeightsError(f"{path} is damaged or not a weights file: {error}") from error
-    if metadata.get("format") != FORMAT:
-        raise WeightsError(f"{path} is not a surromd weights file (format {metadata.get('format')!r}).")
-    if metadata.keys() != {"format", "surromd", "sha256"}:
-        raise WeightsError(f"{path} is damaged or of a later version: it holds {', '.join(sorted(metadata))}.")
-    try:
+        if metadata.get("format") != FORMAT or metadata.keys() != {"format", "surromd", "sha256"}:
+            raise ValueError(f"format {metadata.get('format')!r}")
         return built(Header, parsed(metadata["surromd"])), metadata
-    except ValueError as error:
-        raise WeightsError(f"{path} is damaged or of a later version: its record is none ({error}).") from error
+    except (SafetensorError, OSError, ValueError) as error:
+        raise WeightsError(
+            f"{path} is damaged or not a weights file of this version of surromd ({first_line(error)})."
+        ) from error
 
 
 def load_weights(path: str | Path) -> Weights:
@@ -160,26 +150,16 @@ def load_weights(path: str | Path) -> Weights:
     data = path.read_bytes()
     try:
         state = load(data)
-    except (SafetensorError, ValueError) as error:
-        raise WeightsError(f"{path} is damaged or not a weights file: {error}") from error
-    if metadata["sha256"] != tensor_checksum(metadata["surromd"], state):
-        raise WeightsError(f"{path} is damaged: it is not what was written (checksum); restore it from a whole copy.")
-    try:
+        if metadata["sha256"] != tensor_checksum(metadata["surromd"], state):
+            raise ValueError("it is not what was written (checksum); restore it from a whole copy")
+        if broken := [name for name, tensor in state.items() if not torch.isfinite(tensor).all()]:
+            raise ValueError(f"values are not finite, first in {broken[0]}; train again")
         arch = architecture(header.arch)
-    except UnknownNameError as error:
-        raise WeightsError(f"{path} is of another version of surromd: {error}") from error
-    try:
         _check_sizes(header.config, len(state), max(sum(tensor.numel() for tensor in state.values()), _LEAST_SIZE))
         model = arch.model(arch.config(header.config))
-    except (*UNREADABLE, ArithmeticError, AssertionError, SurromdError) as error:
-        raise WeightsError(f"{path} is damaged: its record is none of a model ({first_line(error)}).") from error
-    try:
         model.load_state_dict(state)
-    except RuntimeError as error:
-        raise WeightsError(f"{path} does not fit its own configuration: {first_line(error)}") from error
-    broken = [name for name, tensor in state.items() if not torch.isfinite(tensor).all()]
-    if broken:
-        raise WeightsError(f"{path} holds values that are not finite (first in {broken[0]}); train again.")
+    except (SafetensorError, *UNREADABLE, ArithmeticError, AssertionError, SurromdError) as error:
+        raise WeightsError(f"{path} is damaged or of another version of surromd: {first_line(error)}") from error
     file_hash = hashlib.sha256(data).hexdigest()[:16]
     return Weights(model.eval().requires_grad_(False), header.domain, header.provenance, file_hash, path)
 

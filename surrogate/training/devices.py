@@ -1,32 +1,23 @@
-"""What a network computes on: CPU or GPU, one process or several, fp32 or bf16, cores, and memory kept for reuse."""
+"""What a network computes on: CPU or GPU, fp32 or bf16, cores, and memory kept for reuse."""
 
 from __future__ import annotations
 
 import ctypes
-import logging
-import os
 import statistics
 import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from functools import cache, lru_cache
-from typing import TYPE_CHECKING
+from functools import cache
 
 import torch
-from torch import Tensor, nn
 
 from systems.errors import InputError
 
-if TYPE_CHECKING:
-    from lightning_fabric import Fabric
-
-
 # fp32 or bf16: which of the two this processor multiplies faster, found by multiplying, once a process. With AMX or
-# avx512_bf16 products in bf16 take a quarter to a fifteenth of the time, without them (or where ONEDNN_MAX_CPU_ISA
-# forbids them) 1.3 to 7 times as long. No other work on the machine moves one across the limit between, so that a seed
-# keeps its meaning on a machine.
+# avx512_bf16 products in bf16 take a quarter to a fifteenth of the time, without them 1.3 to 7 times as long. No other
+# work on the machine moves one across the limit between, so that a seed keeps its meaning on a machine.
 
 # By so much products must be faster before the casts about them pay.
 _PAYS = 1.25
@@ -35,7 +26,6 @@ _PRODUCT = (64, 256, 1792)
 _ROUNDS = 7
 # Steps that are timed on each number of cores, and after how many it is asked again.
 _TIMED_STEPS, _STEPS_BETWEEN = 8, 500
-_UNITS = (("AMX", "_is_amx_tile_supported"), ("avx512_bf16", "_is_avx512_bf16_supported"))
 
 
 @dataclass(frozen=True)
@@ -50,28 +40,6 @@ class Precision:
         return "bf16" if self.bf16 else "fp32"
 
 
-@dataclass(frozen=True)
-class ProductSpeed:
-    """Speed of matrix products on this processor, a batch through a layer, in GFLOP/s; `unit` as `bf16_unit` has it."""
-
-    unit: str
-    fp32_gflops: float
-    bf16_gflops: float
-    threads: int
-
-    @property
-    def ratio(self) -> float:
-        return self.bf16_gflops / self.fp32_gflops
-
-    def describe(self) -> str:
-        """Return 'avx512_bf16; products on 1 thread: fp32 70 GFLOP/s, bf16 310 GFLOP/s (4.4 times as fast)'."""
-        threads = f"{self.threads} thread{'s' if self.threads > 1 else ''}"
-        return (
-            f"{self.unit or 'neither AMX nor avx512_bf16'}; products on {threads}: fp32 "
-            f"{self.fp32_gflops:.3g} GFLOP/s, bf16 {self.bf16_gflops:.3g} GFLOP/s ({self.ratio:.2g} times as fast)"
-        )
-
-
 def choose_precision(wanted: str, *, suits: bool = True) -> Precision:
     """Return the precision for a CPU: as `wanted`, or under 'auto' bf16 where its products are faster. `suits`: whether
     bf16 suits the model at all. Raises InputError for an unknown name, and for bf16 where it does not."""
@@ -83,10 +51,8 @@ def choose_precision(wanted: str, *, suits: bool = True) -> Precision:
         return Precision(wanted == "bf16", "as asked for")
     if not suits:
         return Precision(False, "this model is exact in fp32 alone")
-    speed = product_speed()
-    through = f" through {speed.unit}" if speed.unit else ""
-    reason = f"products in bf16{through} are {speed.ratio:.2g} times as fast as in fp32 here"
-    return Precision(speed.ratio >= _PAYS, reason)
+    fp32, bf16 = product_speed()
+    return Precision(bf16 >= _PAYS * fp32, f"products in bf16 are {bf16 / fp32:.2g} times as fast as in fp32 here")
 
 
 def bf16_pays(device_type: str) -> bool:
@@ -97,8 +63,9 @@ def bf16_pays(device_type: str) -> bool:
 
 
 @cache
-def product_speed() -> ProductSpeed:
-    """Measure products in both precisions by turns, some ms of each; the best of each counts."""
+def product_speed() -> tuple[float, float]:
+    """Return the speed of products of a batch and a layer in fp32 and in bf16, GFLOP/s: the best of some ms each, by
+    turns."""
     rows, n_in, n_out = _PRODUCT
     pairs = {
         dtype: (torch.ones(rows, n_in, dtype=dtype), torch.ones(n_out, n_in, dtype=dtype))
@@ -112,17 +79,7 @@ def product_speed() -> ProductSpeed:
                 torch.nn.functional.linear(x, weight)
                 best[dtype] = min(best[dtype], time.perf_counter() - started)
     gflop = 2e-9 * rows * n_in * n_out
-    fp32, bf16 = gflop / best[torch.float32], gflop / best[torch.bfloat16]
-    return ProductSpeed(bf16_unit(), fp32, bf16, torch.get_num_threads())
-
-
-def bf16_unit() -> str:
-    """Return what this processor has for bf16: 'AMX', 'avx512_bf16', or '' where torch knows of nothing."""
-    for name, question in _UNITS:
-        asked = getattr(torch.cpu, question, None)
-        if asked is not None and asked():
-            return name
-    return ""
+    return gflop / best[torch.float32], gflop / best[torch.bfloat16]
 
 
 @contextmanager
@@ -181,60 +138,10 @@ def keep_freed_memory() -> bool:
     return bool(say(_MMAP_THRESHOLD, _LARGEST_BYTES) and say(_TRIM_THRESHOLD, _KEPT_BYTES))
 
 
-# Devices of a training: one CPU or GPU, or several by Lightning Fabric, started by torchrun [...] -m surrogate.cli.main
-# train REF... -o model.safetensors [...]. Every process draws its own batch; gradients are averaged, so that the whole
-# batch is the setting's times their number. The first process alone validates and writes.
-
-
 def choose_device(name: str) -> str:
-    """Return the torch device for 'auto', 'cpu' or 'cuda': of torchrun's processes each its own GPU. Raises InputError
-    for one that is unknown or not there."""
+    """Return the torch device for 'auto', 'cpu' or 'cuda'. Raises InputError for one that is unknown or not there."""
     if name not in ("auto", "cpu", "cuda"):
         raise InputError(f"the device {name!r} is unknown; choose auto, cpu or cuda.")
     if name == "cuda" and not torch.cuda.is_available():
         raise InputError("there is no CUDA device here; leave `device` out.")
-    if name == "cpu" or not torch.cuda.is_available():
-        return "cpu"
-    local = os.environ.get("LOCAL_RANK")
-    return "cuda" if local is None else f"cuda:{local}"
-
-
-def is_first_process() -> bool:
-    """True in the process that writes: the only one, or torchrun's first."""
-    return os.environ.get("RANK", "0") == "0"
-
-
-def wait_for_all() -> None:
-    """Return when every process has come here: what the first one wrote before is then there for all."""
-    if torch.distributed.is_available() and torch.distributed.is_initialized():
-        torch.distributed.barrier()
-
-
-@lru_cache(maxsize=4)
-def open_fabric(device_type: str, bf16: bool) -> Fabric:
-    """Return a launched Fabric of this process, joined with torchrun's others where there are any."""
-    from lightning_fabric import Fabric
-
-    # On import it sets itself to tell of its precision and processes, through a handler of its own.
-    logging.getLogger("lightning_fabric").setLevel(logging.WARNING)
-    n_processes = int(os.environ.get("WORLD_SIZE", "1"))
-    here = int(os.environ.get("LOCAL_WORLD_SIZE", str(n_processes)))
-    strategy, precision = "ddp" if n_processes > 1 else "auto", "bf16-mixed" if bf16 else "32-true"
-    fabric = Fabric(accelerator=device_type, devices=here, num_nodes=n_processes // here, strategy=strategy,
-                    precision=precision)  # type: ignore[arg-type]  # fmt: skip
-    fabric.launch()
-    return fabric
-
-
-def average_gradients(fabric: Fabric, module: nn.Module, spent_s: float) -> float:
-    """Average the gradients over all processes, in place, in one message (these models are small, and their losses do
-    not go through one `forward`), and return the time that the first one has spent."""
-    if fabric.world_size == 1:
-        return spent_s
-    grads = [p.grad for p in module.parameters() if p.grad is not None]
-    clock = grads[0].new_tensor([spent_s if fabric.is_global_zero else 0.0])
-    flat = fabric.all_reduce(torch.cat([clock, *(g.flatten() for g in grads)]), reduce_op="mean")
-    assert isinstance(flat, Tensor)
-    parts = flat[1:].split([g.numel() for g in grads])
-    torch._foreach_copy_(grads, [part.view_as(g) for part, g in zip(parts, grads, strict=True)])
-    return float(flat[0]) * fabric.world_size
+    return "cuda" if name != "cpu" and torch.cuda.is_available() else "cpu"

@@ -11,21 +11,18 @@ import time
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 from torch import Tensor, nn
 
 from surrogate.training import devices
 from systems.errors import InputError, SimulationError, first_line
-from systems.files.schema import built, parsed
+from systems.files.schema import parsed
 from systems.files.whole_file import create_whole
 from systems.interrupts import stop_if_asked
-
-if TYPE_CHECKING:
-    from lightning_fabric import Fabric
 
 # Muon: momentum of matrices, made orthogonal before it is a step (Jordan et al., kellerjordan.github.io/posts/muon).
 # Potentials learn more by it in the same time (docs/studies/quantum/optimisers.py). torch has one of its own from 2.9
@@ -69,7 +66,7 @@ class Muon(torch.optim.Optimizer):
                     alike[p.shape].append(p)
             for shape, matrices in alike.items():
                 grads = [p.grad for p in matrices if p.grad is not None]
-                momenta = [self._momentum(p) for p in matrices]
+                momenta = [self.state[p].setdefault("momentum", torch.zeros_like(p)) for p in matrices]
                 torch._foreach_lerp_(momenta, grads, 1.0 - MOMENTUM)
                 way = orthogonalised(torch.stack(torch._foreach_lerp(grads, momenta, MOMENTUM)))
                 weights: list[Tensor] = list(matrices)
@@ -77,17 +74,8 @@ class Muon(torch.optim.Optimizer):
                 longer = max(1.0, shape[0] / shape[1]) ** 0.5
                 torch._foreach_add_(weights, list(way.unbind()), alpha=-group["lr"] * longer)
 
-    def _momentum(self, p: nn.Parameter) -> Tensor:
-        state = self.state[p]
-        if not state:
-            state["momentum"] = torch.zeros_like(p)
-        momentum: Tensor = state["momentum"]
-        return momentum
-
 
 # The curves of a training: a CSV that the loop writes, and NAME.svg beside it.
-
-Rows = list[dict[str, str]]
 
 
 def append_row(path: Path, row: dict[str, Any]) -> None:
@@ -110,16 +98,16 @@ def append_row(path: Path, row: dict[str, Any]) -> None:
     create_whole(path, fill)
 
 
-def read_curves(path: Path) -> dict[str, Rows]:
+def read_curves(path: Path) -> dict[str, list[dict[str, str]]]:
     """Return the rows of a training's CSV by stage, in the order of the training."""
-    stages: dict[str, Rows] = {}
+    stages: dict[str, list[dict[str, str]]] = {}
     with path.open(newline="") as handle:
         for row in csv.DictReader(handle):
             stages.setdefault(row["stage"], []).append(row)
     return stages
 
 
-def series(rows: Rows, column: str) -> tuple[list[float], list[float]]:
+def series(rows: list[dict[str, str]], column: str) -> tuple[list[float], list[float]]:
     """Return the steps and values of one column, where it has any."""
     kept = [row for row in rows if row.get(column)]
     return [float(row["step"]) for row in kept], [float(row[column]) for row in kept]
@@ -190,8 +178,6 @@ def load_tensors(path: Path, kind: str) -> tuple[dict[str, Any], dict[str, Tenso
 
 # One optimisation loop for every stage: budget in time or steps, warm-up and cosine, EMA, clipping, exact resume.
 
-# Seeds of one training's processes lie further apart than those of its stages.
-SEEDS_APART = 1_000_003
 # Matrices with fewer rows or columns are no business of Muon's.
 LEAST_MATRIX = 8
 
@@ -271,6 +257,21 @@ class Ema:
             p.copy_(self.shadow[name])
 
 
+@dataclass(frozen=True, eq=False)
+class Stage:
+    """One stage of a training: the `module` that it trains, and how.
+
+    `loss(generator)` draws its own batch from the generator, so that a resumed run draws what an uninterrupted one
+    would have. `saves`: weights are written at each validation, not after the last stage alone.
+    """
+
+    module: nn.Module
+    config: StageConfig
+    loss: LossFn
+    validate: Callable[[], dict[str, float]]
+    saves: bool = True
+
+
 @dataclass(frozen=True)
 class StagePlace:
     """Where a stage runs and writes: its resume `state` (.safetensors), the `log` of its curves (.csv), the device.
@@ -282,35 +283,23 @@ class StagePlace:
     resume: bool = False
 
 
-def run_stage(
-    module: nn.Module,
-    config: StageConfig,
-    loss_fn: LossFn,
-    validate_fn: Callable[[], dict[str, float]],
-    place: StagePlace,
-    *,
-    progress: ProgressFn | None = None,
-    on_save: Callable[[float], None] | None = None,
-) -> float:
-    """Train `module` in place and leave it holding its EMA weights; return the seconds of training spent.
+def run_stage(stage: Stage, place: StagePlace, *, progress: ProgressFn | None = None,
+              on_save: Callable[[float], None] | None = None) -> float:  # fmt: skip
+    """Train a stage's module in place and leave it holding its EMA weights; return the seconds of training spent.
 
-    `loss_fn(generator)` draws its own batch from the generator, so that a resumed run draws what an uninterrupted one
-    would have. Each validation logs a CSV row, saves the resume state and calls `on_save(spent_s)` with EMA weights in.
-    Of several processes (training.devices) each draws its own batches, and the first alone validates and writes.
-    Raises SimulationError when the loss stops being finite; the last saved state stays.
+    Each validation logs a CSV row, saves the resume state and calls `on_save(spent_s)` with EMA weights in. Raises
+    SimulationError when the loss stops being finite; the last saved state stays.
     """
     devices.keep_freed_memory()
-    device = place.device
-    fabric = devices.open_fabric(device.type, config.bf16 and devices.bf16_pays(device.type))
+    module, config, device = stage.module, stage.config, place.device
+    bf16 = config.bf16 and devices.bf16_pays(device.type)
     optimisers = optimisers_of(module, config)
     rates = [[group["lr"] for group in optimiser.param_groups] for optimiser in optimisers]
     ema = Ema(module, config.ema_decay)
-    generator = torch.Generator().manual_seed(config.seed + SEEDS_APART * fabric.global_rank)
+    generator = torch.Generator().manual_seed(config.seed)
     step, spent_s = 0, 0.0
     if place.resume and place.state.exists():
-        step, spent_s = load_state(
-            place.state, module, ema, optimisers, generator, config, process=(fabric.global_rank, fabric.world_size)
-        )
+        step, spent_s = load_state(place.state, module, ema, optimisers, generator, config)
     last = time.monotonic()
     next_validation = spent_s + config.validate_every_s
     sums: dict[str, Tensor] = {}
@@ -321,13 +310,12 @@ def run_stage(
         for optimiser, full in zip(optimisers, rates, strict=True):
             for group, rate in zip(optimiser.param_groups, full, strict=True):
                 group["lr"] = rate * factor
-        with fabric.autocast():
-            loss, terms = loss_fn(generator)
+        with torch.autocast(device.type, dtype=torch.bfloat16, enabled=bf16):
+            loss, terms = stage.loss(generator)
         module.zero_grad(set_to_none=True)
         loss.backward()
         now = time.monotonic()
-        # The first process's clock decides for all when to validate and to end.
-        spent_s, last = devices.average_gradients(fabric, module, spent_s + now - last), now
+        spent_s, last = spent_s + now - last, now
         norm = nn.utils.clip_grad_norm_(module.parameters(), config.clip_norm)
         if not torch.isfinite(norm):
             raise SimulationError(
@@ -343,19 +331,15 @@ def run_stage(
         step += 1
         ended = config.share_done(step, spent_s) >= 1.0
         if spent_s >= next_validation or ended:
-            generators = _all_generators(fabric, generator, device)
             next_validation = spent_s + config.validate_every_s
-            if not fabric.is_global_zero:
-                sums, n_summed = {}, 0
-                continue
             with ema.swapped(module):
-                metrics = {f"train_{k}": float(v) / n_summed for k, v in sums.items()} | validate_fn()
+                metrics = {f"train_{k}": float(v) / n_summed for k, v in sums.items()} | stage.validate()
                 if on_save is not None:
                     on_save(spent_s)
             sums, n_summed = {}, 0
             append_row(place.log, {"stage": config.name, "step": step, "spent_s": round(spent_s, 1),
                                   "learning_rate": config.learning_rate * factor, **metrics})  # fmt: skip
-            save_state(place.state, module, ema, optimisers, generators, step, spent_s, config)
+            save_state(place.state, module, ema, optimisers, generator, step, spent_s, config)
             if progress is not None:
                 progress(config.name, config.share_done(step, spent_s), metrics)
             # Validation is not training: it is left out of the budget.
@@ -366,41 +350,23 @@ def run_stage(
     return spent_s
 
 
-@dataclass(frozen=True, eq=False)
-class Stage:
-    """One stage of a training: the `module` that it trains, and `config`, `loss` and `validate` as `run_stage` takes
-    them. `saves`: weights are written at each validation, not after the last stage alone."""
-
-    module: nn.Module
-    config: StageConfig
-    loss: LossFn
-    validate: Callable[[], dict[str, float]]
-    saves: bool = True
-
-
 def train_stages(
-    stages: Iterable[Stage],
-    out: Path,
-    write: Callable[[list[float]], None],
-    *,
-    device: torch.device,
-    resume: bool = False,
-    progress: ProgressFn | None = None,
-) -> None:
+    stages: Iterable[Stage], out: Path, write: Callable[[list[float]], None], *, device: torch.device,
+    resume: bool = False, progress: ProgressFn | None = None,
+) -> None:  # fmt: skip
     """Train stage after stage and write the weights `out`; beside them stand a CSV of the curves and, until all is
     done, the state of each stage (NAME.STAGE.train.safetensors), from which `resume` goes on.
 
     The next stage is asked for when one has ended: a generator may prepare it from what that has learned, and do what
     is left to do after the last. `write(spent_s)` writes the weights, given the seconds of training of each stage so
-    far; of several processes the first alone calls it. Raises SimulationError when a loss stops being finite.
+    far. Raises SimulationError when a loss stops being finite.
     """
     log, spent_s = out.with_suffix(".csv"), list[float]()
     own = re.compile(re.escape(out.stem) + r"\.[^.]+\.train\.safetensors")
 
     def forget(*more: Path) -> None:
-        if devices.is_first_process():
-            for path in (*more, *(path for path in out.parent.iterdir() if own.fullmatch(path.name))):
-                path.unlink(missing_ok=True)
+        for path in (*more, *(path for path in out.parent.iterdir() if own.fullmatch(path.name))):
+            path.unlink(missing_ok=True)
 
     if not resume:
         forget(log)
@@ -410,35 +376,21 @@ def train_stages(
             write([*spent_s, now_s])
 
         place = StagePlace(out.with_name(f"{out.stem}.{stage.config.name}.train.safetensors"), log, device, resume)
-        spent_s.append(
-            run_stage(
-                stage.module,
-                stage.config,
-                stage.loss,
-                stage.validate,
-                place,
-                progress=progress,
-                on_save=save if stage.saves else None,
-            )
-        )
-    if devices.is_first_process():
-        write(spent_s)
+        spent_s.append(run_stage(stage, place, progress=progress, on_save=save if stage.saves else None))
+    write(spent_s)
     forget()
-    devices.wait_for_all()
 
 
 def optimisers_of(module: nn.Module, config: StageConfig) -> list[torch.optim.Optimizer]:
     """Return AdamW and, with `matrix_rate`, Muon, which share a module's parameters."""
     matrices: list[nn.Parameter] = []
-    decay: list[nn.Parameter] = []
-    plain: list[nn.Parameter] = []
     if config.matrix_rate is not None:
         layers = [layer for layer in module.modules() if isinstance(layer, nn.Linear)]
         own = [p for layer in layers for p in layer.parameters(recurse=False) if p.requires_grad]
         matrices = [p for p in own if p.ndim == 2 and min(p.shape) >= LEAST_MATRIX]
     taken = {id(p) for p in matrices}
-    for p in (p for p in module.parameters() if p.requires_grad and id(p) not in taken):
-        (decay if p.ndim >= 2 else plain).append(p)
+    others = [p for p in module.parameters() if p.requires_grad and id(p) not in taken]
+    decay, plain = [p for p in others if p.ndim >= 2], [p for p in others if p.ndim < 2]
     adam = torch.optim.AdamW(
         [{"params": decay, "weight_decay": config.weight_decay}, {"params": plain, "weight_decay": 0.0}],
         lr=config.learning_rate,
@@ -449,61 +401,31 @@ def optimisers_of(module: nn.Module, config: StageConfig) -> list[torch.optim.Op
     return [adam, Muon(matrices, config.matrix_rate, config.weight_decay)]
 
 
-def _all_generators(fabric: Fabric, generator: torch.Generator, device: torch.device) -> Tensor:
-    """Return the states of all processes' generators: `(n,)` of a single one, else `(processes, n)`."""
-    state = generator.get_state()
-    if fabric.world_size == 1:
-        return state
-    gathered = fabric.all_gather(state.to(device))
-    assert isinstance(gathered, Tensor)
-    return gathered.cpu()
-
-
-@dataclass(frozen=True)
-class StateHeader:
-    """What a training state says of itself."""
-
-    step: int
-    spent_s: float
-    stage: str
-    seed: int
-    batch: int
-    matrix_rate: float | None = None
-
-
-def _prefix(number: int) -> str:
-    """Return what the tensors of an optimiser are called by; the first has no number."""
-    return f"optimiser{number or ''}."
-
-
-def save_state(path: Path, module: nn.Module, ema: Ema, optimisers: list[torch.optim.Optimizer], generators: Tensor,
-               step: int, spent_s: float, config: StageConfig) -> None:  # fmt: skip
+def save_state(path: Path, module: nn.Module, ema: Ema, optimisers: list[torch.optim.Optimizer],
+               generator: torch.Generator, step: int, spent_s: float, config: StageConfig) -> None:  # fmt: skip
     """Write the training state whole or not at all."""
     tensors = {f"model.{k}": v for k, v in module.state_dict().items()}
     tensors |= {f"ema.{k}": v for k, v in ema.shadow.items()}
     for number, optimiser in enumerate(optimisers):
         for index, state in optimiser.state_dict()["state"].items():
-            tensors |= {f"{_prefix(number)}{index}.{k}": v for k, v in state.items()}
-    tensors["generator"] = generators
-    header = StateHeader(step, spent_s, config.name, config.seed, config.batch, config.matrix_rate)
-    save_tensors(path, "surromd_training", asdict(header), tensors)
+            tensors |= {f"optimiser{number or ''}.{index}.{k}": v for k, v in state.items()}
+    tensors["generator"] = generator.get_state()
+    save_tensors(path, "surromd_training", {"step": step, "spent_s": spent_s, **_of_run(config)}, tensors)
+
+
+def _of_run(config: StageConfig) -> dict[str, Any]:
+    """Return what a state has in common with the run that may go on from it."""
+    return {"stage": config.name, "seed": config.seed, "batch": config.batch, "matrix_rate": config.matrix_rate}
 
 
 def load_state(path: Path, module: nn.Module, ema: Ema, optimisers: list[torch.optim.Optimizer],
-               generator: torch.Generator, config: StageConfig, *, process: tuple[int, int] = (0, 1)
-               ) -> tuple[int, float]:  # fmt: skip
-    """Put a saved state back; return (step, spent_s). `process`: this one's number and that of all.
-
-    Raises InputError when the state is damaged, of another run or of another number of processes.
-    """
+               generator: torch.Generator, config: StageConfig) -> tuple[int, float]:  # fmt: skip
+    """Put a saved state back; return (step, spent_s). Raises InputError when it is damaged or of another run."""
     record, tensors = load_tensors(path, "surromd_training")
-    header = built(StateHeader, record)
-    for key, expected in (("stage", config.name), ("seed", config.seed), ("batch", config.batch),
-                          ("matrix_rate", config.matrix_rate)):  # fmt: skip
-        if getattr(header, key) != expected:
+    for key, expected in _of_run(config).items():
+        if (found := record.get(key)) != expected:
             raise InputError(
-                f"training state {path} has {key} {getattr(header, key)!r}, this run {expected!r}; "
-                "remove it to train anew."
+                f"training state {path} has {key} {found!r}, this run {expected!r}; remove it to train anew."
             )
     sub = lambda prefix: {k[len(prefix) :]: v for k, v in tensors.items() if k.startswith(prefix)}  # noqa: E731
     try:
@@ -514,12 +436,9 @@ def load_state(path: Path, module: nn.Module, ema: Ema, optimisers: list[torch.o
         ema.shadow[name].copy_(tensor)
     for number, optimiser in enumerate(optimisers):
         state: dict[int, dict[str, Tensor]] = {}
-        for key, tensor in sub(_prefix(number)).items():
+        for key, tensor in sub(f"optimiser{number or ''}.").items():
             index, name = key.split(".", 1)
             state.setdefault(int(index), {})[name] = tensor
         optimiser.load_state_dict({"state": state, "param_groups": optimiser.state_dict()["param_groups"]})
-    states = torch.atleast_2d(tensors["generator"])
-    if len(states) != process[1]:
-        raise InputError(f"training state {path} is of {len(states)} processes, this run has {process[1]}.")
-    generator.set_state(states[process[0]])
-    return header.step, header.spent_s
+    generator.set_state(tensors["generator"])
+    return record["step"], record["spent_s"]

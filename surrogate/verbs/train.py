@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, nullcontext
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -36,19 +36,16 @@ def windows(references: Trajectories, out: PathLike, options: WindowsOptions) ->
     is. `velocities` keeps these as well, for PAINET, and leaves frames in their own pose. Raises InputError when
     scenes, save intervals or conditions differ, TrajectoryError for damaged files.
     """
-    from surrogate.data import load_frames, write_windows
+    from surrogate.data import collect_frames
 
     out = Path(out)
     check_outputs([out], [".h5"], overwrite=options.overwrite)
     paths = find_trajectories(references, verify=True)
     held = [] if options.validation is None else find_trajectories(options.validation, verify=True)
     canonical = options.canonical and not options.velocities
-    write_windows(paths, out, canonical=canonical, velocities=options.velocities, held=held)
-    try:
-        load_frames(out).refuse_leaks()
-    except InputError:
-        out.unlink()
-        raise
+    frames = collect_frames(paths, canonical=canonical, velocities=options.velocities, held=held, spool=out.parent)
+    frames.refuse_leaks()
+    frames.save(out)
     return out
 
 
@@ -72,20 +69,19 @@ def train(references: Trajectories, out: PathLike, options: TrainOptions) -> Pat
 
     With `level='gfn2-xtb'` it learns one molecule, named as by `reference`, from that level's energies and forces:
     painet as a potential, which asks about the states that it is least sure of. The samples stay beside the weights
-    (NAME.samples.safetensors), and the error of forces against evaluations (NAME.rounds.csv).
+    (NAME.samples.safetensors).
 
     Architecture and settings that are not given are chosen to suit the references, and each choice is said with its
     reason (`explain_training` returns them all); one molecule at one spacing of frames gets lam-slide as it is.
 
     `arch`: an installed architecture (`models.architecture.names`): lam-slide; lam-slide-peptides; painet or its
     decoder alone, egnn, which learn from velocities (a reference made with `save_velocities=True` and natural hydrogen
-    masses); or a baseline that is fitted in one go: frozen, constant-velocity, resampling, normal-modes, msm. The
-    others end after `budget_s` seconds of training or `steps` optimiser steps over all stages, whichever is given.
-    `start_from`: weights (name or file) whose second stage is trained further, with their configuration. `validation`:
-    trajectories that the curves are measured on; without any it is the last twentieth of each; molecules that are in
-    `validation` alone are held out whole. A stretch of motion that would be both trained on and validated on is
-    refused. `longest_lag_ps`: every spacing of frames from that of the references to this one is learned. `device`:
-    'auto', 'cpu' or 'cuda'; several devices by torchrun (surrogate.training.devices).
+    masses); or a baseline that is fitted in one go: frozen, resampling, normal-modes. The others end after `budget_s`
+    seconds of training or `steps` optimiser steps over all stages, whichever is given. `start_from`: weights (name or
+    file) whose second stage is trained further, with their configuration. `validation`: trajectories that the curves
+    are measured on; without any it is the last twentieth of each; molecules that are in `validation` alone are held out
+    whole. A stretch of motion that would be both trained on and validated on is refused. `longest_lag_ps`: every
+    spacing of frames from that of the references to this one is learned. `device`: 'auto', 'cpu' or 'cuda'.
 
     Beside `out`, a CSV holds the training curves and, until done, files the state that `resume` goes on from; at the
     end the curves are drawn (.svg), and a short rollout that is checked frame by frame says whether the weights are
@@ -109,19 +105,20 @@ def train(references: Trajectories, out: PathLike, options: TrainOptions) -> Pat
             written = learn_molecule(references, asked, options, _shown(bar))
         _conclude(written, fitted=False, quiet=options.quiet)
         return written
-    from surrogate.training.devices import choose_device, is_first_process
+    from surrogate.training.devices import choose_device
 
     plan = _plan(references, options.validation, replace(asked, device=choose_device(options.device)))
-    first, quiet = is_first_process(), options.quiet
     prepared = plan.trainer.prepare(plan.references, plan.request)
-    if first and not quiet:
+    if not options.quiet:
         for line in plan.lines():
             tell(out.name, line)
-    lock = OutputLock(out) if first else nullcontext()
-    with lock, progress_bar(f"training {prepared.scene}", quiet=quiet or not first) as bar, _said_when_stopped(out):
+    with (
+        OutputLock(out),
+        progress_bar(f"training {prepared.scene}", quiet=options.quiet) as bar,
+        _said_when_stopped(out),
+    ):
         written = prepared.start(_shown(bar))
-    if first:
-        _conclude(written, fitted=plan.trainer.fitted, quiet=quiet)
+    _conclude(written, fitted=plan.trainer.fitted, quiet=options.quiet)
     return written
 
 
@@ -205,11 +202,11 @@ def _plan(references: Trajectories, validation: Trajectories | None, asked: Trai
 def _suited(references: References) -> tuple[str, str]:
     """Return the name of the architecture that suits the references best, and why."""
     survey = references.survey
-    fits = [(fit, name) for name in names() if (fit := architecture(name).suits(survey)) is not None]
+    fits = [(*fit, name) for name in names() if (fit := architecture(name).suits(survey)) is not None]
     if not fits:
         raise InputError("no installed architecture suits these references by itself; name one with `arch`.")
-    best, name = max(fits, key=lambda found: found[0].rank)
-    return name, best.reason
+    _, why, name = max(fits)
+    return name, why
 
 
 @contextmanager

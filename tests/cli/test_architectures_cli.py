@@ -69,7 +69,7 @@ def test_a_forecaster_is_trained_and_rolls_out(tmp_path: Path, moving: Path, arc
         assert re.search(reason, said), said
 
 
-@pytest.mark.parametrize("arch", ["frozen", "normal-modes", "msm"])
+@pytest.mark.parametrize("arch", ["frozen", "normal-modes", "resampling"])
 def test_a_baseline_is_fitted_and_rolls_out(tmp_path: Path, moving: Path, arch: str) -> None:
     weights, out = str(tmp_path / "b.safetensors"), tmp_path / "roll.h5"
     done("train", str(moving), "--arch", arch, "-o", weights)
@@ -85,7 +85,7 @@ def test_what_an_architecture_cannot_use_is_refused(tmp_path: Path, moving: Path
     assert "Did you mean 'painet'?" in refusal("train", str(moving), "--arch", "painte", "--steps", "4", *out)
     assert "--longest-lag" in refusal("train", str(moving), "--arch", "painet", "--steps", "4", "--longest-lag", "1ps",
                                       *out)  # fmt: skip
-    assert "--budget" in refusal("train", str(moving), "--arch", "msm", "--budget", "1min", *out)
+    assert "--budget" in refusal("train", str(moving), "--arch", "frozen", "--budget", "1min", *out)
     assert "--budget 30min" in refusal("train", str(moving), "--arch", "painet", *out)
     still = str(tmp_path / "still.h5")
     done("windows", str(moving), "-o", still)

@@ -22,7 +22,7 @@ from systems.trajectory.companion_writer import pdb_text
 
 COMMANDS = ["demo", "run", "systems", "plan", "reference", "windows", "train", "rollout", "compare", "info"]
 SURROMD = [sys.executable, "-m", "surrogate.cli.main"]
-HEAVY = ["numpy", "torch", "openmm", "h5py", "mdtraj", "rdkit", "scipy", "matplotlib", "lightning_fabric"]
+HEAVY = ["numpy", "torch", "openmm", "h5py", "mdtraj", "rdkit", "scipy", "matplotlib"]
 
 
 # ---- starting ------------------------------------------------------------------------------------------------------

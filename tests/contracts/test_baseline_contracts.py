@@ -10,17 +10,16 @@ import torch
 
 from surrogate.data import TrainingFrames
 from surrogate.models.baselines import (
+    Baseline,
     BaselineConfig,
-    ConstantVelocity,
     FrozenFrame,
-    MarkovStateModel,
     NormalModes,
     TrainingFrameResampling,
     autoregression,
     fit_baseline,
 )
 from surrogate.models.conformance import PropagatorContract
-from surrogate.models.propagator import Molecule, Propagator
+from surrogate.models.propagator import Propagator
 from surrogate.models.weights import load_weights
 from surrogate.sampling.runner import RolloutConfig, rollout
 from systems.errors import InputError
@@ -41,11 +40,6 @@ class TestFrozenFrame(PropagatorContract):
         return FrozenFrame(BaselineConfig(n_new=4))
 
 
-class TestConstantVelocity(TestFrozenFrame):
-    def make(self, n_atoms: int) -> Propagator:
-        return ConstantVelocity(BaselineConfig(n_new=4))
-
-
 class TestResampling(PropagatorContract):
     uses_frames = False
     bf16_error = None
@@ -63,18 +57,6 @@ class TestNormalModes(PropagatorContract):
         model = NormalModes(BaselineConfig(4, n_atoms, n_modes=min(5, 3 * n_atoms)))
         model.modes.copy_(torch.linalg.qr(normal(3 * n_atoms, model.config.n_modes))[0].T)
         model.coefficients.copy_(torch.tensor([[1.2], [-0.6], [0.1]]))
-        return model
-
-
-class TestMarkovStateModel(PropagatorContract):
-    bf16_error = None
-
-    def make(self, n_atoms: int) -> Propagator:
-        model = MarkovStateModel(BaselineConfig(4, n_atoms, n_frames=6, n_states=3))
-        model.centres_nm.copy_(normal(3, n_atoms, 3) * 0.1)
-        model.frames_nm.copy_(normal(6, n_atoms, 3))
-        model.first.copy_(torch.tensor([0, 1, 3, 6]))
-        model.cumulative.copy_(torch.tensor([[0.8, 0.9, 1.0], [0.1, 0.9, 1.0], [0.0, 0.5, 1.0]]))
         return model
 
 
@@ -102,31 +84,30 @@ def test_an_oscillator_is_forecast_exactly_and_an_overdamped_mode_keeps_its_rela
     np.testing.assert_allclose([a[1], b[1], s[1]], [0.6, 0.0, 0.8], atol=0.02)
 
 
-def rolled(arch: str, frames: TrainingFrames, folder: Path, n_frames: int, replicas: int = 1) -> np.ndarray:
-    weights = load_weights(fit_baseline(arch, frames, folder / f"{arch}.safetensors"))
-    outs = [folder / f"{arch}_{k}.h5" for k in range(replicas)]
+def rolled(kind: type[Baseline], frames: TrainingFrames, folder: Path, n_frames: int, replicas: int = 1) -> np.ndarray:
+    weights = load_weights(fit_baseline(kind, frames, folder / "w.safetensors"))
+    outs = [folder / f"{k}.h5" for k in range(replicas)]
     rollout(frames.scene, weights, outs, RolloutConfig(time_ps=float(n_frames), precision="fp32"))
     found = []
     for out in outs:
         with open_trajectory(out) as reader:
-            assert reader.record["model"] == arch
+            assert reader.record["model"] == kind.arch
             found.append(reader.read())
     return np.stack(found)
 
 
-def test_frozen_frames_and_constant_velocity_stay_where_they_start(
+def test_frozen_frames_stay_where_they_start(
     tmp_path: Path, harmonic_frames: TrainingFrames, alanine_dipeptide: Scene
 ) -> None:
-    for arch in ("frozen", "constant-velocity"):
-        found = rolled(arch, harmonic_frames, tmp_path, 40)
-        np.testing.assert_allclose(found[0], np.broadcast_to(alanine_dipeptide.positions_nm, found[0].shape), atol=2e-6)
+    found = rolled(FrozenFrame, harmonic_frames, tmp_path, 40)
+    np.testing.assert_allclose(found[0], np.broadcast_to(alanine_dipeptide.positions_nm, found[0].shape), atol=2e-6)
 
 
 def test_normal_modes_keep_variance_and_correlation_through_a_rollout(
     tmp_path: Path, harmonic_frames: TrainingFrames
 ) -> None:
     """The fixture's frames are a linear process with correlation 0.8 from frame to frame, 0.004 nm wide."""
-    found = rolled("normal-modes", harmonic_frames, tmp_path, 400, replicas=6).astype(np.float64)[:, 50:]
+    found = rolled(NormalModes, harmonic_frames, tmp_path, 400, replicas=6).astype(np.float64)[:, 50:]
     lengths = np.linalg.norm(found[:, :, 1] - found[:, :, 4], axis=-1)
     reference = harmonic_frames.positions_nm(np.arange(800)).astype(np.float64)
     ref = np.linalg.norm(reference[:, 1] - reference[:, 4], axis=-1)
@@ -135,44 +116,18 @@ def test_normal_modes_keep_variance_and_correlation_through_a_rollout(
     assert (z[:, 1:] * z[:, :-1]).mean() / z.var() == pytest.approx(0.8, abs=0.06)
 
 
-def test_resampled_and_markov_frames_are_training_frames(tmp_path: Path, harmonic_frames: TrainingFrames) -> None:
+def test_resampled_frames_are_training_frames(tmp_path: Path, harmonic_frames: TrainingFrames) -> None:
     starts = harmonic_frames.window_starts(1, validation=False)
-    known = harmonic_frames.positions_nm(starts)
     distances = lambda x: np.linalg.norm(x[:, :, None] - x[:, None], axis=-1).reshape(len(x), -1)  # noqa: E731
-    for arch in ("resampling", "msm"):
-        found = rolled(arch, harmonic_frames, tmp_path, 32)[0]
-        gaps = np.abs(distances(found)[:, None] - distances(known)[None]).max(-1)
-        assert gaps.min(1).max() < 5e-6, arch
-        assert len(set(gaps.argmin(1))) > 8, "not one and the same frame"
+    found = rolled(TrainingFrameResampling, harmonic_frames, tmp_path, 32)[0]
+    gaps = np.abs(distances(found)[:, None] - distances(harmonic_frames.positions_nm(starts))[None]).max(-1)
+    assert gaps.min(1).max() < 5e-6
+    assert len(set(gaps.argmin(1))) > 8, "not one and the same frame"
 
 
-def test_a_markov_state_model_has_the_populations_and_the_rate_of_its_reference(alanine_dipeptide: Scene) -> None:
-    """Two structures, hopping with probability 0.05 and 0.15 per frame: three quarters of the time in the first."""
-    from surrogate.data import canonicalise, quantise
-    from surrogate.models.baselines import fit_markov_state_model
-
-    rng = np.random.default_rng(3)
-    state = np.zeros(6000, dtype=int)
-    for t in range(1, 6000):
-        state[t] = state[t - 1] ^ (rng.random() < (0.05, 0.15)[state[t - 1]])
-    shapes = np.stack([alanine_dipeptide.positions_nm] * 2)
-    shapes[1, :8] += 0.1
-    positions = canonicalise(shapes[state] + 0.002 * rng.normal(size=(6000, 22, 3)), alanine_dipeptide)
-    frames = TrainingFrames(alanine_dipeptide, quantise(positions), np.array([0, 6000]), 1.0, True, {}, ())
-    model = fit_markov_state_model(frames, 2000, rng)
-    noise = torch.randn(4, 2000, 2, generator=torch.Generator().manual_seed(1))
-    start = torch.from_numpy(frames.positions_nm(np.zeros((4, 1), dtype=np.int64)))
-    found = model.next_chunk(start, Molecule.of(alanine_dipeptide), noise).frames_nm.flatten(0, 1).numpy()
-    centres = [positions[state == k].mean(0) for k in (0, 1)]
-    which = np.argmin([np.square(found - c).sum((1, 2)) for c in centres], axis=0).reshape(4, 2000)
-    assert (which == 0).mean() == pytest.approx((state == 0).mean(), abs=0.04)
-    hops = (which[:, 1:] != which[:, :-1]).mean()
-    assert hops == pytest.approx((state[1:] != state[:-1]).mean(), rel=0.15)
-
-
-@pytest.mark.parametrize(("arch", "at_random"), [("resampling", True), ("msm", True), ("normal-modes", False)])
+@pytest.mark.parametrize(("kind", "at_random"), [(TrainingFrameResampling, True), (NormalModes, False)])
 def test_frames_drawn_at_random_have_no_limit_of_jumps(
-    tmp_path: Path, harmonic_frames: TrainingFrames, arch: str, at_random: bool
+    tmp_path: Path, harmonic_frames: TrainingFrames, kind: type[Baseline], at_random: bool
 ) -> None:
-    limits = load_weights(fit_baseline(arch, harmonic_frames, tmp_path / "w.safetensors")).domain.limits
+    limits = load_weights(fit_baseline(kind, harmonic_frames, tmp_path / "w.safetensors")).domain.limits
     assert limits is not None and (len(limits["jump_idx"]) == 0) == at_random

@@ -105,9 +105,11 @@ def test_it_is_trained_rolled_and_described_by_name(tmp_path: Path) -> None:
         noise = rng.normal(size=(200, scene.n_atoms, 3))
         writer.append(scene.positions_nm + width_nm * noise, np.arange(1.0, 201.0))
     (tmp_path / "walk.toml").write_text('arch = "random-walk"\n[model]\nn_new = 5\n[training]\nbatch = 16\n')
-    told = run("train", str(reference), "--config", str(tmp_path / "walk.toml"), "--steps", "200", "-o", str(weights))
-    assert told.exit_code == 0, told.stderr
-    assert "arch = random-walk" in told.stderr and "walk 200 steps" in told.stderr
+    trained = run(
+        "train", str(reference), "--config", str(tmp_path / "walk.toml"), "--steps", "200", "-o", str(weights)
+    )
+    assert trained.exit_code == 0, trained.stderr
+    assert "arch = random-walk" in trained.stderr and "walk 200 steps" in trained.stderr
     found = json.loads(run("info", str(weights), "--json").stdout)
     assert found["arch"] == "random-walk" and found["config"]["n_new"] == 5
     rolled = run("rollout", "alanine-dipeptide", "--weights", str(weights), "--time", "8ps", "--guard", "off", "-o",
@@ -126,12 +128,12 @@ def test_it_is_trained_rolled_and_described_by_name(tmp_path: Path) -> None:
 
 def test_what_it_makes_of_a_scene_reaches_its_network() -> None:
     scene, model = load("alanine-dipeptide"), TestRandomWalk().make(22)
-    told = model.featurise(scene).to(torch.device("cpu"))
-    assert told.own.tolist() == np.bincount(scene.bonds.ravel()).tolist()
+    molecule = model.featurise(scene).to(torch.device("cpu"))
+    assert molecule.own.tolist() == np.bincount(scene.bonds.ravel()).tolist()
     noise = torch.ones(1, 22, 3, 3)
-    step = model.next_chunk(torch.zeros(1, 1, 22, 3), told, noise).frames_nm[0, 0, :, 0]
-    plain = model.next_chunk(torch.zeros(1, 1, 22, 3), replace(told, own=None), noise).frames_nm[0, 0, :, 0]
-    torch.testing.assert_close(step / plain, torch.where(told.own > 1, 1.0, 1.5))
+    step = model.next_chunk(torch.zeros(1, 1, 22, 3), molecule, noise).frames_nm[0, 0, :, 0]
+    plain = model.next_chunk(torch.zeros(1, 1, 22, 3), replace(molecule, own=None), noise).frames_nm[0, 0, :, 0]
+    torch.testing.assert_close(step / plain, torch.where(molecule.own > 1, 1.0, 1.5))
 
 
 def test_it_is_listed_and_a_misspelt_name_meets_it() -> None:

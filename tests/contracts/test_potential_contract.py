@@ -160,8 +160,8 @@ def test_frames_stay_as_they_were_when_the_next_are_made(rows: int) -> None:
 def test_simd_is_for_single_precision_few_atoms_and_a_model_at_rest(monkeypatch: pytest.MonkeyPatch) -> None:
     def by_simd(model: PainetPotential, n_atoms: int) -> bool:
         x, molecule = walks(n_atoms), branched_chain(n_atoms)
-        made = model.network.prepare(fabric := model.fabric(molecule), x)
-        found = simd_potential_of(model.network, fabric, made, len(x)) is not None
+        made = model.network.prepare(topology := model.topology(molecule), x)
+        found = simd_potential_of(model.network, topology, made, len(x)) is not None
         torch.testing.assert_close(
             model.forces(x, molecule).float(), evaluated(model, x, molecule)[1].float(), rtol=1e-4, atol=0.05
         )
@@ -266,10 +266,10 @@ def test_pairs_grow_with_the_atoms_and_not_with_their_square() -> None:
 
 def test_latent_energy_is_that_of_the_paper() -> None:
     model, molecule = lively().double(), branched_chain(9)
-    fabric, step = model.fabric(molecule), lively().double().network.steps[0]
+    topology, step = model.topology(molecule), lively().double().network.steps[0]
     q = torch.nn.functional.normalize(torch.randn(2, 2, 9, 4, dtype=torch.float64), dim=-1)
     phi, psi = step.type_matrices()
-    found = latent_energy(q, phi, psi, fabric)
+    found = latent_energy(q, phi, psi, topology)
     types = molecule.elements
     for head in range(2):
         b = 0.25 * psi[head][types][:, types]
@@ -282,7 +282,7 @@ def test_members_agree_with_the_potential_and_differ_from_each_other() -> None:
     molecule, model = branched_chain(9), lively().double()
     x = walks(9)
     _, forces = evaluated(model, x, molecule)
-    members = model.member_forces(x, model.fabric(molecule))
+    members = model.member_forces(x, model.topology(molecule))
     torch.testing.assert_close(members.mean(0), forces)
     assert (members[0] - members[1]).abs().max() > 1.0
 
@@ -293,7 +293,7 @@ def test_impossible_settings_are_refused() -> None:
             PotentialConfig(**wrong)
     heavy = Molecule(torch.tensor([90]), torch.tensor([232.0]), torch.zeros(0, 2, dtype=torch.int64))
     with pytest.raises(InputError, match="90"):
-        lively().fabric(heavy)
+        lively().topology(heavy)
 
 
 def test_heavy_hydrogens_take_their_mass_from_their_neighbours() -> None:

@@ -258,7 +258,7 @@ def sampled(
     samples = []
     for _ in range(n_samples):
         noise = torch.randn((len(known), *model.noise_shape(n)), generator=generator).to(known.device)
-        latents = solve(predict, noise, settings.solver_steps, "linear")
+        latents = solve(predict, noise, settings.solver_steps)
         samples.append(model.decode(latents[:, known.shape[1] :], n).double().cpu().numpy())
     return np.stack(samples)
 

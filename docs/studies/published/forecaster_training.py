@@ -19,7 +19,7 @@ from surrogate.models.lam_slide.trainer import (
     flow_loss,
     random_rotations,
 )
-from surrogate.training.loop import ProgressFn, StageConfig, StagePlace, run_stage
+from surrogate.training.loop import ProgressFn, Stage, StageConfig, StagePlace, run_stage
 from systems.errors import SurromdError
 
 
@@ -336,11 +336,5 @@ def run_training(
                 "again with --resume."
             )
 
-    return run_stage(
-        module,
-        stage,
-        loss_fn,
-        validate,
-        StagePlace(training.state(stage.name), training.log, torch.device(training.device), training.resume),
-        progress=progress,
-    )
+    place = StagePlace(training.state(stage.name), training.log, torch.device(training.device), training.resume)
+    return run_stage(Stage(module, stage, loss_fn, validate), place, progress=progress)

@@ -35,14 +35,14 @@ def normal_modes(molecules: Sequence[MoleculeWindows], settings: Settings) -> Fi
     """Independent modes, each an autoregression over two frames (`models.baselines.NormalModes`), without its noise."""
     import torch
 
-    from surrogate.models.baselines import NormalModes, normal_modes_of
+    from surrogate.models.baselines import NormalModes
     from surrogate.models.propagator import Molecule
 
     models: dict[str, NormalModes] = {}
     for m in molecules:
         starts = m.every_start["train"]
         triples = m.windows(starts[:: max(1, len(starts) // 10_000)])[:, N_GIVEN - 3 : N_GIVEN]
-        models[m.name] = normal_modes_of(_inside_each(m, triples)[1], N_NEW)
+        models[m.name] = NormalModes.of(_inside_each(m, triples)[1], N_NEW)
 
     @torch.no_grad()
     def forecast(m: MoleculeWindows, given: Array, n_samples: int) -> Array:

@@ -41,7 +41,7 @@ from surrogate.models.lam_slide.trainer import (
     flow_loss,
     random_rotations,
 )
-from surrogate.training.loop import StageConfig, StagePlace, run_stage
+from surrogate.training.loop import Stage, StageConfig, StagePlace, run_stage
 from systems.files.whole_file import create_whole
 
 NAME = "n-body-charged"
@@ -162,7 +162,7 @@ def run(change: Change, train: ParticleSet, held: ParticleSet, folder: Path, ste
     stage = StageConfig(
         "flow", change.batch, 2e-3, None, steps, warmup_steps=50, ema_decay=0.99, validate_every_s=every_s
     )
-    seconds = run_stage(network, stage, loss, validate, place)
+    seconds = run_stage(Stage(network, stage, loss, validate), place)
     state.unlink()
     return Found(change.name, steps, round(seconds, 1), **(errors or validate()), **code)
 
@@ -269,7 +269,7 @@ def _code(model: LamSlide, draw: DrawWindows, batch: int, state: Path) -> None:
 
     stage = StageConfig("code", batch, 2e-3, None, CODE_STEPS, warmup_steps=50, ema_decay=0.99, bf16=False)
     place = StagePlace(state, state.with_suffix("").with_suffix(".csv"), torch.device("cpu"), resume=True)
-    run_stage(model.autoencoder, stage, loss, dict, place)
+    run_stage(Stage(model.autoencoder, stage, loss, dict), place)
 
 
 def _code_errors(view: WindowView, back: Array, held: ParticleSet) -> dict[str, float]:

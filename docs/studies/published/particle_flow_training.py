@@ -79,5 +79,5 @@ def sample_ahead(model: ParticleFlow, given: Given, solver_steps: int, generator
             with torch.autocast(o.device.type, dtype=torch.bfloat16):  # as it was trained
                 return model(o, tau, known)
 
-        drawn.append(flow.euler(predict, noise[rows], solver_steps, "linear"))
+        drawn.append(flow.euler(predict, noise[rows], solver_steps))
     return torch.cat(drawn)

@@ -39,9 +39,9 @@ def main() -> None:
             sets |= {f"GAFF2, {t:g} K": ref.motion(80, 1.0, t, seed=SEED) for t in (300.0, 500.0, 700.0)}
             for what, states in sets.items():
                 asked = ref.label(states)
-                told = model.evaluate(torch.tensor(asked.positions_nm), molecule)
-                error = force_error(told.forces_kj_mol_nm.numpy(), asked.forces_kj_mol_nm)
-                off = (told.energy_kj_mol.numpy() - asked.energies_kj_mol).std()
+                found = model.evaluate(torch.tensor(asked.positions_nm), molecule)
+                error = force_error(found.forces_kj_mol_nm.numpy(), asked.forces_kj_mol_nm)
+                off = (found.energy_kj_mol.numpy() - asked.energies_kj_mol).std()
                 sys.stdout.write(f"{Path(name).stem} | MD by {what} | {len(asked.positions_nm)} | "
                                  f"{error:.2f} kcal/mol/Å | {off:.2f} kJ/mol\n")  # fmt: skip
                 sys.stdout.flush()

@@ -22,7 +22,7 @@ from md_reference.run.machine import machine_name
 from surrogate.models.painet.energy import PainetPotential, PotentialConfig
 from surrogate.models.painet.potential_trainer import Learner, PotentialTraining, samples_path
 from surrogate.models.weights import load_weights
-from surrogate.training.loop import StageConfig, StagePlace, run_stage
+from surrogate.training.loop import Stage, StageConfig, StagePlace, run_stage
 from systems.units import parse_wall_s
 
 
@@ -38,8 +38,8 @@ def learned(scene: Any, samples: Path, budget_s: float, seed: int, matrix_rate: 
         stage = StageConfig("potential", config.batch, config.learning_rate, budget_s, matrix_rate=matrix_rate,
                             seed=seed, bf16=False, validate_every_s=1e9)  # fmt: skip
         learner.begin(budget_s)
-        run_stage(model, stage, learner.loss, dict, StagePlace(out.with_suffix(".state"), out.with_suffix(".csv"),
-                                                               torch.device("cpu")))  # fmt: skip
+        place = StagePlace(out.with_suffix(".state"), out.with_suffix(".csv"), torch.device("cpu"))
+        run_stage(Stage(model, stage, learner.loss, dict), place)
         return {**learner.errors(), "steps": float(learner._steps)}
 
 

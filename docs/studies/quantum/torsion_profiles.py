@@ -48,9 +48,9 @@ def rows(name: str) -> list[list[str]]:
     for quad in rotatable_torsions(scene, rotors=True).tolist():
         scan = np.stack([turned(at, quad, 2.0 * np.pi * k / STEPS, graph) for k in range(STEPS)])
         asked = np.array([reference(x)[0] for x in scan])
-        told = model.evaluate(torch.tensor(scan), molecule).energy_kj_mol.numpy()
+        energies = model.evaluate(torch.tensor(scan), molecule).energy_kj_mol.numpy()
         low = asked - asked.min() < HIGHEST_KJ_MOL
-        off = (told - asked)[low] - (told - asked)[low].mean()
+        off = (energies - asked)[low] - (energies - asked)[low].mean()
         torsion = "-".join(f"{scene.elements[k]}{k}" for k in quad)
         found.append([Path(name).stem, torsion, f"{np.ptp(asked):.1f}", f"{low.sum()} of {STEPS}",
                       f"{np.sqrt(np.square(off).mean()):.2f}", f"{np.abs(off).max():.2f}"])  # fmt: skip

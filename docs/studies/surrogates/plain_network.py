@@ -17,8 +17,7 @@ from surrogate.models.layers import ParallelBlock
 
 def plain_network(network: Approximator, o: Tensor, tau: Tensor, conditioning: Tensor) -> Tensor:
     """Return what `network(o, tau, conditioning)` does; one latent vector per token."""
-    c = network.config
-    skip, out, scale_in = (flow.expand(v, o) for v in flow.preconditioning(tau, c.interpolant))
+    skip, out, scale_in = (flow.expand(v, o) for v in flow.preconditioning(tau))
     n_known, n_frames = conditioning.shape[1], o.shape[1]
     mask = (torch.arange(n_frames) < n_known).long()
     padded = torch.cat([conditioning, conditioning.new_zeros(o[:, n_known:].shape)], dim=1)
@@ -37,7 +36,7 @@ def plain_network(network: Approximator, o: Tensor, tau: Tensor, conditioning: T
         h = h.reshape(batch, n_latents, n_frames, width).transpose(1, 2)
     shift, scale = network.final_modulation(time)[:, None, None].chunk(2, dim=-1)
     found = network.final(F.layer_norm(h, (width,)) * (1.0 + scale) + shift)
-    return skip * o + out * found if c.precondition else found
+    return skip * o + out * found if network.config.precondition else found
 
 
 def plain_block(block: ParallelBlock, x: Tensor, modulation: Tensor, cos: Tensor, sin: Tensor) -> Tensor:

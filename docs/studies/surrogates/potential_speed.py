@@ -54,13 +54,13 @@ def main() -> None:
         scene = scene_from_smiles(smiles)
         molecule, reference = Molecule.of(scene), Potential(scene)
         at = torch.tensor(scene.positions_nm)[None]
-        fabric = model.fabric(molecule)
-        made = model.network.prepare(fabric, at)
+        topology = model.topology(molecule)
+        made = model.network.prepare(topology, at)
         moved = iter(at + 0.003 * torch.randn(2 + ROUNDS, *at.shape[1:], dtype=at.dtype))
         line = [f"{smiles}, {scene.n_atoms} atoms: GFN2-xTB {least_ms(partial(ask, reference, moved)):.3g} ms"]
         for rows in map(int, given.batches.split(",")):
             x = at + 0.003 * torch.randn(rows, *at.shape[1:], dtype=at.dtype)
-            by_torch = gradient_of(partial(model.members, fabric=fabric, made=made))
+            by_torch = gradient_of(partial(model.members, topology=topology, made=made))
             costs = [least_ms(partial(force, x)) / rows for force in (by_torch, model.gradient(x, molecule))]
             line.append(f"batch {rows}: " + ", by SIMD ".join(f"{cost:.3g}" for cost in costs))
         sys.stdout.write("; ".join(line) + "\n")

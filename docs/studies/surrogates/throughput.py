@@ -157,7 +157,7 @@ def sampling_ratio(batch: int, rounds: int, *, compiled: bool = False) -> dict[s
     def sample(name: str, n_steps: int = PAPER_STEPS) -> Tensor:
         bf16, network = ways[name]
         with torch.inference_mode(), torch.autocast("cpu", dtype=torch.bfloat16, enabled=bf16):
-            return flow.euler(network(), noise, n_steps, "linear")
+            return flow.euler(network(), noise, n_steps)
 
     seconds = [{name: least_seconds(lambda n=name: sample(n), 1) for name in ways} for _ in range(rounds)]  # type: ignore[misc]
     reference = sample("plain fp32", 1)[:, PAPER.n_conditioning :]

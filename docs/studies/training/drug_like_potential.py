@@ -23,7 +23,7 @@ from drug_like_states import read_list
 from safetensors.torch import load_file, save_file
 from torch import Tensor
 
-from surrogate.models.painet.energy import NO_WALL_NM, Fabric, PainetPotential, PotentialConfig
+from surrogate.models.painet.energy import NO_WALL_NM, PainetPotential, PotentialConfig, Topology
 from surrogate.models.propagator import Molecule
 from surrogate.training.devices import torch_threads
 from surrogate.training.loop import Stage, StageConfig, train_stages
@@ -40,7 +40,7 @@ VALIDATED = 40
 class Labelled:
     """States of one molecule: `positions_nm` and `forces` (n, n_atoms, 3), `energies` (n,), in kJ/mol and nm."""
 
-    fabric: Fabric
+    topology: Topology
     positions_nm: Tensor
     energies: Tensor
     forces: Tensor
@@ -60,7 +60,7 @@ def load(folder: Path, splits: Sequence[str], most: int | None = None) -> list[L
             molecule = Molecule(numbers, torch.ones(len(numbers)), torch.from_numpy(data["bonds"]))
             arrays = (data["positions_nm"][kept], energies[kept].astype(np.float32), data["forces_kj_mol_nm"][kept])
         if kept.sum() >= 8:
-            found.append(Labelled(Fabric.of(molecule), *map(torch.from_numpy, arrays)))
+            found.append(Labelled(Topology.of(molecule), *map(torch.from_numpy, arrays)))
         if most and len(found) >= most:
             break
     return found
@@ -88,11 +88,11 @@ class Learner:
             pick = torch.randint(len(one.energies), (self.rows,), generator=generator)
             member = int(torch.multinomial(self.bags[k], 1, generator=generator))
             at = one.positions_nm[pick].requires_grad_(True)
-            told = self.model.members(at, one.fabric)[:, member]
-            (gradient,) = torch.autograd.grad(told.sum(), at, create_graph=True)
+            found = self.model.members(at, one.topology)[:, member]
+            (gradient,) = torch.autograd.grad(found.sum(), at, create_graph=True)
             wrong = (gradient + one.forces[pick]) / (10.0 * scale)
             force.append((wrong.square().sum(-1) + 1e-8).sqrt().mean())
-            off = (told - one.energies[pick]) / scale
+            off = (found - one.energies[pick]) / scale
             energy.append((off - off.mean()).square().mean() / at.shape[1] ** 0.5)
         of_forces, of_energies = torch.stack(force).mean(), torch.stack(energy).mean()
         return of_forces + 0.1 * of_energies, {"force": of_forces.detach(), "energy": of_energies.detach()}
@@ -108,7 +108,7 @@ def errors_of(model: PainetPotential, one: Labelled, most: int = 24) -> tuple[fl
     (kcal/mol), and the root mean square spread of the members' forces (kcal/mol/Å), over a molecule's first states."""
     x = one.positions_nm[:most]
     at = x.clone().requires_grad_(True)
-    totals = model.members(at, one.fabric)
+    totals = model.members(at, one.topology)
     by_member = -torch.stack([torch.autograd.grad(t, at, retain_graph=True)[0] for t in totals.sum(0)]).detach()
     forces = by_member.mean(0)
     off = totals.detach().mean(-1).float() - one.energies[:most]
@@ -127,7 +127,7 @@ def set_walls(model: PainetPotential, learned: list[Labelled]) -> None:
     nearest = torch.full_like(network.nearest_nm, NO_WALL_NM)
     farthest = torch.zeros_like(network.farthest_nm)
     for one in learned:
-        network.set_walls(one.positions_nm, one.fabric)
+        network.set_walls(one.positions_nm, one.topology)
         seen = network.nearest_nm > 0
         nearest[seen] = torch.minimum(nearest, network.nearest_nm)[seen]
         bound = network.farthest_nm < NO_WALL_NM

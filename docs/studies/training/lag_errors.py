@@ -54,7 +54,7 @@ class Row:
         return float((1.0 - correlation**2) / self.starts**0.5)
 
 
-def train(references: Sequence[Path], out: Path, *, longest_lag_ps: float, budget_s: float, compile_: bool) -> None:
+def train(references: Sequence[Path], out: Path, *, longest_lag_ps: float, budget_s: float) -> None:
     """Train one model for all lags; what is there stays, what was interrupted goes on."""
     from processes import is_trained
 
@@ -64,7 +64,7 @@ def train(references: Sequence[Path], out: Path, *, longest_lag_ps: float, budge
 
     if is_trained(out):
         return
-    settings = TrainingConfig(budget_s=budget_s, time_reversal=True, longest_lag_ps=longest_lag_ps, compile=compile_)
+    settings = TrainingConfig(budget_s=budget_s, time_reversal=True, longest_lag_ps=longest_lag_ps)
     config = LamSlideConfig(approximator=ApproximatorConfig(chunk_frames=CHUNK_FRAMES))
     train_lam_slide(collect_frames(list(references)), out, config, settings, resume=True)
 
@@ -154,12 +154,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--test", type=Path, nargs="+", required=True, help="references that training does not see")
     parser.add_argument("--longest-lag-ps", type=float, default=1000.0)
     parser.add_argument("--budget", default="50min", help="wall time of the training")
-    parser.add_argument("--compile", action="store_true", help="compile the network; needs a C++ compiler")
     parser.add_argument("--starts", type=int, default=128, help="frames that each lag is started from")
     a = parser.parse_args(arguments)
     a.folder.mkdir(parents=True, exist_ok=True)
     out = a.folder / "lags.safetensors"
-    train(a.train, out, longest_lag_ps=a.longest_lag_ps, budget_s=parse_wall_s(a.budget), compile_=a.compile)
+    train(a.train, out, longest_lag_ps=a.longest_lag_ps, budget_s=parse_wall_s(a.budget))
     weights, test = load_weights(out), collect_frames(list(a.test))
     rows = []
     for lag_ps in LAGS_PS:

@@ -113,7 +113,7 @@ def arrival_loss(
         def predict(o: Tensor, tau: Tensor) -> Tensor:
             return torch.where(filled, by(o, tau, conditioning), 0.0)
 
-        return flow.SOLVERS[_SOLVER](predict, noise, n_steps, "linear")
+        return flow.SOLVERS[_SOLVER](predict, noise, n_steps)
 
     with torch.no_grad():
         target = arrived(labeller, _LABELLER_STEPS)

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import copy
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import ClassVar, cast
+from typing import Any, ClassVar, cast
 
 import torch
 from torch import Tensor, nn
@@ -45,8 +44,8 @@ class AutoencoderConfig:
 
 @dataclass(frozen=True)
 class ApproximatorConfig:
-    """Stage two. `interpolant` 'linear' or 'gvp' (eq. 7, 8). `precondition` scales skip and output of the data
-    prediction by the flow time so that its error vanishes with the noise (Karras 2022, for this path)."""
+    """Stage two. `precondition` scales skip and output of the data prediction by the flow time so that its error
+    vanishes with the noise (Karras 2022, for this path)."""
 
     chunk_frames: int = 32
     n_conditioning: int = 1
@@ -55,7 +54,6 @@ class ApproximatorConfig:
     width: int = 256
     n_layers: int = 7
     n_heads: int = 4
-    interpolant: str = "linear"
     precondition: bool = True
     # Conditioning frames see neither the flow time nor the frames that follow them, so that a chunk's evaluations
     # compute them once; False is the paper.
@@ -86,6 +84,14 @@ class LamSlideConfig(ModelConfig):
     position_scale_nm: float = 0.2
     autoencoder: AutoencoderConfig = field(default_factory=AutoencoderConfig)
     approximator: ApproximatorConfig = field(default_factory=ApproximatorConfig)
+
+    @classmethod
+    def from_dict(cls, record: dict[str, Any]) -> LamSlideConfig:
+        """See `ModelConfig.from_dict`; the interpolant that older weights name is always the linear one."""
+        stage_two = record.get("approximator")
+        if isinstance(stage_two, dict) and stage_two.get("interpolant") == "linear":
+            record = record | {"approximator": {k: v for k, v in stage_two.items() if k != "interpolant"}}
+        return super().from_dict(record)
 
 
 # Stage one: a cross-attention encoder into a few latent vectors and a decoder queried by identifier (section 3.3).
@@ -159,19 +165,6 @@ class Autoencoder(nn.Module):
         logits = self.to_element(h).float() if with_types else None
         with torch.autocast(h.device.type, enabled=False):
             return Decoded(self.to_position(h.float()), logits)
-
-
-def pair_distances(x: Tensor) -> Tensor:
-    """Return distances `(..., n, n)` (eq. 15), differentiable on the diagonal."""
-    difference = x.unsqueeze(-2) - x.unsqueeze(-3)
-    return (difference.square().sum(-1) + 1e-12).sqrt()
-
-
-def reconstruction_losses(x: Tensor, decoded: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the position loss (eq. 13) and the inter-distance loss (eq. 14), in scaled units squared."""
-    position = (x - decoded).square().sum(-1).mean()
-    distance = (pair_distances(x) - pair_distances(decoded)).square().mean()
-    return position, distance
 
 
 # Stage two: the latent flow model, transformer layers alternating over latents and time (Algorithms 4 and 5).
@@ -250,10 +243,9 @@ class Approximator(nn.Module):
     ) -> Tensor:
         """Return the predicted data `(b, T, L, dim)`.
 
-        `o` (b, T, L, dim) noisy latents, `tau` (b,), `conditioning` (b, n_conditioning, L, dim) clean latents of the
-        first frames. The first frames of `o` carry no information: they are replaced by the clean ones. With
-        `clean_conditioning` they come back as they are, and `memory` is what `remember` said of them, so that the
-        evaluations of one chunk compute it once. `lag` (b, width): the embedded lag, for a network that takes it.
+        `o` (b, T, L, dim) noisy latents, of which the first frames are replaced by `conditioning` (b, n_conditioning,
+        L, dim), clean ones; `tau` (b,). With `clean_conditioning` these come back as they are, and `memory` is what
+        `remember` returns, once a chunk. `lag` (b, width): the embedded lag, for a network that takes it.
         """
         c = self.config
         time = self.embed_time(tau) if lag is None else self.embed_time(tau) + lag
@@ -278,10 +270,9 @@ class Approximator(nn.Module):
         return memory
 
     def _denoise(self, o: Tensor, tau: Tensor, network: Callable[[Tensor], Tensor]) -> Tensor:
-        c = self.config
-        if not c.precondition:
+        if not self.config.precondition:
             return network(o)
-        skip, out, scale_in = (flow.expand(v, o) for v in flow.preconditioning(tau, c.interpolant))
+        skip, out, scale_in = (flow.expand(v, o) for v in flow.preconditioning(tau))
         return skip * o + out * network(o * scale_in)
 
     def _network(self, o: Tensor, time: Tensor, conditioning: Tensor) -> Tensor:
@@ -330,24 +321,23 @@ class Approximator(nn.Module):
 class LamSlide(Propagator):
     """Encoder, approximator and decoder (section 3), behind the contract of `surrogate.models.propagator`.
 
-    Latents are used as (z - mean) / scale with a mean per latent component and one common scale, both measured on the
-    training frames: LayerNorm bounds their power but leaves constant offsets that carry no information.
+    Latents are used as (z - mean) / scale with a mean per component and one common scale of the training frames.
     """
 
     arch: ClassVar[str] = "lam-slide"
     float32_layers: tuple[str, ...] = ("autoencoder.to_position",)
+    solvers: tuple[str, ...] = ("multistep", "fitted", "euler")
     config: LamSlideConfig
 
     def __init__(self, config: LamSlideConfig) -> None:
         super().__init__()
         self.config = config
-        self.solvers = flow.solvers_for(config.approximator.interpolant)
         self.n_conditioning = config.approximator.n_conditioning
         n_latents, latent_dim = config.autoencoder.n_latents, config.autoencoder.latent_dim
         self.autoencoder = Autoencoder(config.autoencoder)
         self.approximator = Approximator(config.approximator, n_latents, latent_dim)
-        # Spacing of the frames that `next_chunk` returns: the shortest of the range, until `at_lag` sets another.
-        self.lag_ps = config.approximator.lag_range_ps[0] if config.approximator.lag_range_ps else None
+        self.lag_range_ps = config.approximator.lag_range_ps
+        self.lag_ps = self.lag_range_ps[0] if self.lag_range_ps else None
         self.latent_mean = nn.Buffer(torch.zeros(n_latents, latent_dim))
         self.latent_scale = nn.Buffer(torch.ones(()))
 
@@ -358,15 +348,6 @@ class LamSlide(Propagator):
     def identifiers(self, n_atoms: int) -> Tensor:
         """The canonical assignment `(n_atoms,)`: identifier k for the template's atom k."""
         return torch.arange(n_atoms, device=self.latent_mean.device)
-
-    def at_lag(self, lag_ps: float) -> LamSlide:
-        """Return this model, its weights shared, with frames `lag_ps` apart. Raises InputError outside its range."""
-        known = self.config.approximator.lag_range_ps
-        if known is None or not known[0] * (1 - 1e-6) <= lag_ps <= known[1] * (1 + 1e-6):
-            raise InputError(f"a lag of {lag_ps:g} ps is none that this model was trained for.")
-        model = copy.copy(self)
-        model.lag_ps = lag_ps
-        return model
 
     def embedded_lag(self, lag_ps: Tensor | None, rows: int) -> Tensor | None:
         """Return the lags `(rows,)` (the model's own where None) as the latent flow takes them, `(rows, width)`; None
@@ -401,18 +382,11 @@ class LamSlide(Propagator):
     def next_chunk(self, last_frames_nm: Tensor, molecule: Molecule, noise: Tensor, *, solver_steps: int = 10,
                    solver: str | None = None, last_velocities_nm_ps: Tensor | None = None) -> Chunk:  # fmt: skip
         """See `Propagator.next_chunk`. Velocities play no part."""
-        solver = solver or self.solvers[0]
-        if solver in flow.ADAPTIVE and len(noise) > 1:
-            pairs = zip(last_frames_nm.split(1), noise.split(1), strict=True)
-            rows = [self.next_chunk(x, molecule, n, solver_steps=solver_steps, solver=solver) for x, n in pairs]
-            mean = sum(row.evaluations or 0.0 for row in rows) / len(rows)
-            return Chunk(torch.cat([row.frames_nm for row in rows]), evaluations=mean)
-        c = self.config.approximator
         # Frames that training turned at random, it had about their middle.
         middle_nm = 0.0 if self.config.canonical else last_frames_nm[:, -1:].mean(-2, keepdim=True)
         known = self.encode(last_frames_nm - middle_nm, molecule.elements)
         lag = self.embedded_lag(None, len(known))
-        memory = self.approximator.remember(known, lag) if c.clean_conditioning else None
+        memory = self.approximator.remember(known, lag) if self.config.approximator.clean_conditioning else None
         evaluations = 0
 
         def predict(o: Tensor, tau: Tensor) -> Tensor:
@@ -420,6 +394,6 @@ class LamSlide(Propagator):
             evaluations += 1
             return self.approximator(o, tau, known, memory, lag)
 
-        latents = flow.SOLVERS[solver](predict, noise, solver_steps, c.interpolant)
+        latents = flow.SOLVERS[solver or self.solvers[0]](predict, noise, solver_steps)
         frames = self.decode(latents[:, self.n_conditioning :], last_frames_nm.shape[-2])
         return Chunk(frames + middle_nm, evaluations=float(evaluations))

@@ -16,13 +16,7 @@ from torch.nn import functional as F
 from surrogate.data import References, StrideSampler, Survey, TrainingFrames, strides_up_to
 from surrogate.models import architecture as arch
 from surrogate.models.lam_slide import flow
-from surrogate.models.lam_slide.model import (
-    AutoencoderConfig,
-    LamSlide,
-    LamSlideConfig,
-    draw_identifiers,
-    reconstruction_losses,
-)
+from surrogate.models.lam_slide.model import AutoencoderConfig, LamSlide, LamSlideConfig, draw_identifiers
 from surrogate.models.weights import Weights, load_weights, provenance_of, read_header, save_weights, training_domain
 from surrogate.training.devices import bf16_pays
 from surrogate.training.loop import ProgressFn, Stage, StageConfig, train_stages
@@ -46,6 +40,12 @@ def random_rotations(n: int, generator: torch.Generator) -> Tensor:
     return torch.stack(rows, dim=-1).reshape(n, 3, 3)
 
 
+def pair_distances(x: Tensor) -> Tensor:
+    """Return distances `(..., n, n)` (eq. 15), differentiable on the diagonal."""
+    difference = x.unsqueeze(-2) - x.unsqueeze(-3)
+    return (difference.square().sum(-1) + 1e-12).sqrt()
+
+
 def autoencoder_loss(
     model: LamSlide, frames_nm: Tensor, elements: Tensor, generator: torch.Generator
 ) -> tuple[Tensor, dict[str, Tensor]]:
@@ -62,7 +62,8 @@ def autoencoder_loss(
     latents = model.autoencoder.encode(x, numbers, identifiers)
     noise = torch.randn(latents.shape, generator=generator).to(x.device)
     decoded = model.autoencoder.decode(latents + c.latent_noise * noise, identifiers, with_types=c.type_weight > 0)
-    position, distance = reconstruction_losses(x, decoded.positions)
+    position = (x - decoded.positions).square().sum(-1).mean()
+    distance = (pair_distances(x) - pair_distances(decoded.positions)).square().mean()
     loss = c.position_weight * position + c.distance_weight * distance
     terms = {"position": position, "distance": distance}
     if decoded.type_logits is not None:
@@ -87,21 +88,18 @@ def flow_loss(
     on the predicted frames (with `loss_on_given` on all), plus decoded position and distance. `lag`: see
     `LamSlide.embedded_lag`.
 
-    With preconditioning the error is divided by c_out^2, so that every flow time asks for the same relative precision;
-    without it the weight is one, as in the paper. The decoded terms compare with the decoded clean latents, so that the
-    decoder's own error is not charged to the approximator.
+    With preconditioning the error is divided by c_out^2, so that every flow time asks for the same relative precision.
+    Decoded terms compare with the decoded clean latents: the decoder's own error is none of the approximator's.
     """
     c = model.config.approximator
     known = latents[:, : c.n_conditioning]
     noise = torch.randn(latents.shape, generator=generator).to(latents.device)
-    alpha, sigma, _, _ = (flow.expand(v, latents) for v in flow.coefficients(tau, c.interpolant))
-    noisy = alpha * latents + sigma * noise
     first = 0 if c.loss_on_given else c.n_conditioning
-    prediction = model.approximator(noisy, tau, known, lag=lag)[:, first:]
+    prediction = model.approximator(flow.mixed(latents, noise, tau), tau, known, lag=lag)[:, first:]
     target = latents[:, first:]
     weight = torch.ones_like(tau)
     if c.precondition:
-        weight = flow.preconditioning(tau, c.interpolant)[1].square().reciprocal()
+        weight = flow.preconditioning(tau)[1].square().reciprocal()
     loss = ((prediction - target).square().flatten(1).mean(1) * weight).mean()
     terms = {"flow": loss.detach()}
     if c.auxiliary_frames and (c.position_weight or c.distance_weight):
@@ -213,8 +211,6 @@ class TrainingConfig:
     bf16: bool = True
     device: str = "cpu"
     validate_every_s: float = 60.0
-    # Compile stage two's network and the decoder; needs a C++ compiler on the machine.
-    compile: bool = False
     # Present every other window backwards: exact for positions of a system in equilibrium (microscopic
     # reversibility), and each rare event then shows how it begins and how it ends.
     time_reversal: bool = False
@@ -235,15 +231,9 @@ class TrainingConfig:
 
 
 def train_lam_slide(
-    frames: TrainingFrames,
-    out: str | Path,
-    model_config: LamSlideConfig,
-    config: TrainingConfig,
-    *,
-    start: Weights | None = None,
-    resume: bool = False,
-    progress: ProgressFn | None = None,
-) -> Path:
+    frames: TrainingFrames, out: str | Path, model_config: LamSlideConfig, config: TrainingConfig, *,
+    start: Weights | None = None, resume: bool = False, progress: ProgressFn | None = None,
+) -> Path:  # fmt: skip
     """Train on `frames` and write `out` (.safetensors); beside it a CSV of the curves and, until done, resume states.
 
     With `start`, stage two goes on from those weights for the whole budget, and stage one is taken over as it is.
@@ -294,17 +284,19 @@ def _resolve(frames: TrainingFrames, model_config: LamSlideConfig, config: Train
 def _strides(frames: TrainingFrames, model_config: LamSlideConfig) -> tuple[int, ...]:
     """Return the strides that windows are drawn with. Raises InputError for lags that the frames do not have."""
     lags = model_config.approximator.lag_range_ps
-    if lags is None:
-        return (1,)
-    if not np.isclose(lags[0], frames.lag_ps, rtol=1e-4):
-        raise InputError(f"the model's lags begin at {lags[0]:g} ps, frames of {frames.scene.name} are saved every "
-                         f"{frames.lag_ps:g} ps.")  # fmt: skip
-    longest = whole_steps(lags[1], frames.lag_ps, "the longest lag in the frames' spacing")
-    if longest < 2:
-        raise InputError("the longest lag must be at least twice the frames' spacing; leave it out for one lag alone.")
-    strides = strides_up_to(longest)
-    # Too short a reference is refused before the first stage has been trained.
-    StrideSampler.of(frames, model_config.approximator.chunk_frames, strides)
+    strides: tuple[int, ...] = (1,)
+    if lags is not None:
+        if not np.isclose(lags[0], frames.lag_ps, rtol=1e-4):
+            raise InputError(f"the model's lags begin at {lags[0]:g} ps, frames of {frames.scene.name} are saved every "
+                             f"{frames.lag_ps:g} ps.")  # fmt: skip
+        longest = whole_steps(lags[1], frames.lag_ps, "the longest lag in the frames' spacing")
+        if longest < 2:
+            raise InputError(
+                "the longest lag must be at least twice the frames' spacing; leave it out for one lag alone."
+            )
+        strides = strides_up_to(longest)
+    for validation in (False, True):  # too short a reference is refused before the first stage has been trained
+        StrideSampler.of(frames, model_config.approximator.chunk_frames, strides, validation=validation)
     return strides
 
 
@@ -335,39 +327,29 @@ def window_frames(first: Tensor, length: int, generator: torch.Generator, *, tim
 
 def _stage_two(subject: Subject, config: TrainingConfig, stage: StageConfig) -> Stage:
     model, device, frames = subject.model, subject.device, subject.frames
-    length, several = model.config.approximator.chunk_frames, len(subject.strides) > 1
-    starts = torch.from_numpy(frames.window_starts(length, validation=False))
-    wide = StrideSampler.of(frames, length, subject.strides)
+    length = model.config.approximator.chunk_frames
+    own, others = (StrideSampler.of(frames, length, subject.strides, validation=held) for held in (False, True))
     model.autoencoder.requires_grad_(False)
-    if config.compile:
-        model.approximator.compile()
-        model.autoencoder.decode = torch.compile(model.autoencoder.decode)  # type: ignore[method-assign]
     subject.keep_latents()
 
     def loss_of(
-        idx: Tensor, stride: Tensor | None, tau: Tensor, generator: torch.Generator
+        idx: Tensor, stride: Tensor, tau: Tensor, generator: torch.Generator
     ) -> tuple[Tensor, dict[str, Tensor]]:
         latents = subject.windows(idx, generator)
-        lag = model.embedded_lag(None if stride is None else (stride * frames.lag_ps).to(device), len(idx))
+        lag = model.embedded_lag((stride * frames.lag_ps).to(device), len(idx))
         return flow_loss(model, latents, len(subject.elements), tau, generator, lag)
 
     def loss_fn(generator: torch.Generator) -> tuple[Tensor, dict[str, Tensor]]:
-        stride = None
-        if several:
-            first, stride = wide.draw(stage.batch, generator)
-        else:
-            first = starts[torch.randint(len(starts), (stage.batch,), generator=generator)]
+        first, stride = own.draw(stage.batch, generator)
         tau = draw_flow_times(model, stage.batch, generator).to(device)
         idx = window_frames(first, length, generator, time_reversal=config.time_reversal, stride=stride)
         return loss_of(idx, stride, tau, generator)
 
-    held_stride = None
-    if several:
-        sampler = StrideSampler.of(frames, length, subject.strides, validation=True)
-        held, held_stride = sampler.draw(_HELD_WINDOWS, torch.Generator().manual_seed(0))
-    else:
-        held = torch.from_numpy(frames.window_starts(length, validation=True))
-        held = held[torch.linspace(0, len(held) - 1, min(_HELD_WINDOWS, len(held))).long()]
+    held, held_stride = others.draw(_HELD_WINDOWS, torch.Generator().manual_seed(0))
+    if len(subject.strides) == 1:
+        every = others.starts[0]
+        held = every[torch.linspace(0, len(every) - 1, min(_HELD_WINDOWS, len(every))).long()]
+        held_stride = torch.ones_like(held)
     held = window_frames(held, length, torch.Generator(), time_reversal=False, stride=held_stride)
     with_bf16 = stage.bf16 and bf16_pays(device.type)
 
@@ -405,13 +387,11 @@ class LamSlideTrainer(arch.Trainer):
     learns_lags = True
 
     def check(self, request: arch.TrainingRequest) -> None:
-        """See `Trainer.check`."""
         super().check(request)
         if request.steps is not None and request.steps < 2:
             raise InputError("`steps` must be at least 2: one for each stage.")
 
     def choose(self, references: References, request: arch.TrainingRequest) -> tuple[arch.Choice, ...]:
-        """See `Trainer.choose`."""
         survey, found = references.survey, list[arch.Choice]()
         if request.start_from is not None:
             return ()
@@ -425,7 +405,6 @@ class LamSlideTrainer(arch.Trainer):
         return tuple(found)
 
     def settings(self, request: arch.TrainingRequest) -> arch.Settings:
-        """See `Trainer.settings`."""
         model = request.model if request.start_from is None else read_header(request.start_from).config
         steps, first = request.steps, None
         if steps is not None:
@@ -442,13 +421,10 @@ class LamSlideTrainer(arch.Trainer):
         return arch.Settings(LamSlideConfig.from_dict(model), request.settings(TrainingConfig, asked), _RESOLVED)
 
     def prepare(self, references: References, request: arch.TrainingRequest) -> arch.Prepared:
-        """See `Trainer.prepare`."""
         settings = self.settings(request)
         model: LamSlideConfig = settings.model
         start = None if request.start_from is None else load_weights(request.start_from)
         frames = references.frames(canonical=model.canonical)
-        for validation in (False, True):  # too short a reference is refused before the first stage has been trained
-            frames.window_starts(model.approximator.chunk_frames, validation=validation)
         share_one = 0.0 if start is not None else STAGE_ONE_SHARE
 
         def run(advance: arch.AdvanceFn) -> Path:
@@ -462,8 +438,8 @@ class LamSlideTrainer(arch.Trainer):
         return arch.Prepared(frames.scene.name, run)
 
 
-def _suits(survey: Survey) -> arch.Suitability | None:
-    return arch.Suitability(0, "one molecule") if survey.one_molecule else None
+def _suits(survey: Survey) -> tuple[int, str] | None:
+    return (0, "one molecule") if survey.one_molecule else None
 
 
 LAM_SLIDE = arch.Architecture("lam-slide", LamSlideConfig.from_dict, LamSlide, LamSlideTrainer, _suits)

@@ -2,12 +2,9 @@
 
 Embeddings start from types of atoms in their bonded surroundings. Each latent step looks at an atom's neighbourhood
 (sums of functions of distance and direction, and the invariants of these), then takes a step of the paper's descent
-(`EnergyAttention`), in which positions are carried along: the mean of all atoms' positions under positive weights that
-depend on embeddings and types is a vector that knows the whole molecule, at a cost linear in its atoms.
-
-The energy is read from the last embeddings, from a table of pair energies, and from the latent energy that attention
-descends, sum_ij rho_ij(|q_i - q_j|^2) with rho = a s - b s^2 (the paper's equation of E(H), and "Particle-type Adaptive
-Mapping").
+(`EnergyAttention`), in which positions are carried along: their mean under positive weights that depend on embeddings
+and types is a vector that knows the whole molecule, at a cost linear in its atoms. The energy is read from the last
+embeddings, from a table of pair energies, and from the latent energy that attention descends (the paper's E(H)).
 """
 
 from __future__ import annotations
@@ -17,6 +14,7 @@ from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import lru_cache
+from itertools import combinations
 from pathlib import Path
 from typing import Any, ClassVar, NamedTuple, cast
 
@@ -26,7 +24,7 @@ import torch
 from torch import Tensor, nn
 
 from md_reference import simd as engine
-from surrogate.models.painet.model import EnergyAttention, TypeGroups, type_groups
+from surrogate.models.painet.model import EnergyAttention, TypeGroups, bond_paths, check_attention, type_groups
 from surrogate.models.potential import TOLERANCE, Bath, GradientFn, IntegratorConfig, Potential, at_rest, gradient_of
 from surrogate.models.propagator import Molecule
 from systems.errors import InputError
@@ -39,11 +37,10 @@ SIZES = ("width", "n_steps", "n_radial", "n_scalars", "n_vectors", "n_tensors", 
 class PotentialConfig(IntegratorConfig):
     """Size of the network, beside the settings of the MD on it.
 
-    `n_steps` latent steps, each a look at the neighbourhood and, between them, energy-descent attention over all atoms.
-    An atom sees its neighbours by `n_scalars`, `n_vectors` and `n_tensors` sums of products of `n_radial` functions of
-    the distance. `n_members`: read-outs that learn from different samples; their mean is the potential, their spread
-    says where it is unsure. `attention`: 'linear' (factored over types), 'dense' (the same numbers) or 'auto'.
-    """
+    `n_steps` latent steps, each a look at the neighbourhood and energy-descent attention over all atoms. An atom sees
+    its neighbours by `n_scalars`, `n_vectors` and `n_tensors` sums of products of `n_radial` functions of the distance.
+    `n_members`: read-outs that learn from different samples; their mean is the potential, their spread says where it is
+    unsure. `attention`: 'linear' (factored over types), 'dense' (the same numbers) or 'auto'."""
 
     width: int = 64
     n_steps: int = 2
@@ -63,18 +60,14 @@ class PotentialConfig(IntegratorConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.attention not in ("auto", "linear", "dense"):
-            raise InputError(f"attention = {self.attention!r} is unknown; choose auto, linear or dense.")
+        check_attention(self, ("auto", "linear", "dense"))
         for name in SIZES:
             if getattr(self, name) < (least := 2 if name == "n_radial" else 1):
                 raise InputError(f"{name} = {getattr(self, name)} must be at least {least}.")
-        if not 0.0 < self.step < 1.0 or not 0.0 <= self.psi_limit < 1.0:
-            raise InputError(f"step = {self.step:g} and psi_limit = {self.psi_limit:g} must lie between 0 and 1.")
 
 
-# Ordered pairs of atoms within reach of each other, and the smooth functions of their distance that a potential sees.
-# Pairs up to three bonds apart count always, others inside a cutoff, at which all they add has come down to zero with
-# its first two derivatives. So the number of pairs grows with the atoms and not with their square.
+# Ordered pairs of atoms, and the smooth functions of their distance that a potential sees. Pairs up to three bonds
+# apart count always, others inside a cutoff, at which all they add has come to zero with its first two derivatives.
 
 # Shells: one, two and three bonds apart, and all that lie further.
 N_SHELLS = 4
@@ -144,18 +137,7 @@ class EdgeGeometry(NamedTuple):
 
 def bonded_shells(molecule: Molecule) -> dict[tuple[int, int], int]:
     """Return how many bonds less one lie between atoms (i, j), i < j, up to three."""
-    neighbours: list[list[int]] = [[] for _ in range(molecule.n_atoms)]
-    for i, j in molecule.bonds.tolist():
-        neighbours[i].append(j)
-        neighbours[j].append(i)
-    shells: dict[tuple[int, int], int] = {}
-    for start in range(molecule.n_atoms):
-        seen, front = {start}, {start}
-        for shell in range(N_SHELLS - 1):
-            front = {k for j in front for k in neighbours[j]} - seen
-            seen |= front
-            shells |= {(start, k): shell for k in front if k > start}
-    return shells
+    return {pair: n - 1 for pair, n in bond_paths(molecule, N_SHELLS - 1).items()}
 
 
 def find_edges(
@@ -164,13 +146,13 @@ def find_edges(
     """Return the edges of frames `(rows, n_atoms, 3)` nm of a molecule: those that any of the frames needs."""
     n_atoms = positions_nm.shape[1]
     dense = n_atoms <= few
-    pairs = _all_pairs(n_atoms) if dense else {}
-    if not dense:
+    if dense:
+        pairs = _all_pairs(n_atoms)
+    else:
         from scipy.spatial import cKDTree
 
-        for frame in positions_nm.detach().cpu().double().numpy():
-            near: np.ndarray = cKDTree(frame).query_pairs(cutoff_nm, output_type="ndarray")
-            pairs |= {(int(i), int(j)): N_SHELLS - 1 for i, j in near}
+        trees = map(cKDTree, positions_nm.detach().cpu().double().numpy())
+        pairs = {pair: N_SHELLS - 1 for tree in trees for pair in tree.query_pairs(cutoff_nm)}
     pairs |= shells
     own = [(i, i, N_SHELLS - 1) for i in range(n_atoms)] if dense else []
     both = sorted([(i, j, s) for (i, j), s in pairs.items()] + [(j, i, s) for (i, j), s in pairs.items()] + own)
@@ -179,17 +161,15 @@ def find_edges(
 
 
 def _all_pairs(n_atoms: int) -> dict[tuple[int, int], int]:
-    return {(i, j): N_SHELLS - 1 for i in range(n_atoms) for j in range(i + 1, n_atoms)}
+    return dict.fromkeys(combinations(range(n_atoms), 2), N_SHELLS - 1)
 
 
 def measure_edges(
     positions_nm: Tensor, edges: Edges, n_radial: int, cutoff_nm: float, dtype: torch.dtype
 ) -> EdgeGeometry:
-    """Return distances, directions and radial functions of frames `(n_atoms, rows, 3)` nm, in `dtype`.
-
-    Radial functions are bumps (1 - (u - k)^2 / HALF_WIDTH^2)^3, zero outside, with u = log d in units of their spacing;
-    without exponentials, whose tails would be denormal numbers. Distances are softened by 0.1 pm: finite at zero.
-    """
+    """Return distances, directions and radial functions of frames `(n_atoms, rows, 3)` nm, in `dtype`: bumps
+    (1 - (u - k)^2 / HALF_WIDTH^2)^3, zero outside, with u = log d in units of their spacing (exponentials would have
+    denormal tails). Distances are softened by 0.1 pm: finite at zero."""
     apart = edges.apart_nm(positions_nm).to(dtype)
     # An atom is to itself as one far beyond the cutoff.
     alone = torch.where(edges.receiver == edges.sender, _FAR_NM2, _SOFTENING_NM2).to(dtype)
@@ -227,7 +207,7 @@ NO_WALL_NM, _LEAST_NM = 1e3, 1e-3
 
 
 @dataclass(frozen=True, eq=False)
-class Fabric:
+class Topology:
     """What of a molecule does not change while it moves: the shells of its bonds, the types that are `present`, each
     type's atoms."""
 
@@ -239,12 +219,12 @@ class Fabric:
     one_hot: Tensor
 
     @staticmethod
-    def of(molecule: Molecule) -> Fabric:
+    def of(molecule: Molecule) -> Topology:
         present = torch.unique(molecule.elements)
         bonds = torch.cat([molecule.bonds.T, molecule.bonds.T.flip(0)], dim=1)
         one_hot = (present[:, None] == molecule.elements).to(torch.get_default_dtype())
         groups = type_groups(molecule.elements)
-        return Fabric(molecule, bonded_shells(molecule), bonds, present, groups, one_hot)
+        return Topology(molecule, bonded_shells(molecule), bonds, present, groups, one_hot)
 
 
 class EdgeWeights(NamedTuple):
@@ -339,32 +319,28 @@ class EnergyNetwork(nn.Module):
         self.nearest_nm = nn.Buffer(torch.zeros(N_SHELLS, N_TYPES, N_TYPES))
         self.farthest_nm = nn.Buffer(torch.full((N_SHELLS, N_TYPES, N_TYPES), NO_WALL_NM))
 
-    def set_walls(self, positions_nm: Tensor, fabric: Fabric) -> None:
+    def set_walls(self, positions_nm: Tensor, topology: Topology) -> None:
         """Stand walls a little beyond the distances of samples `(n, n_atoms, 3)` nm: the shortest of all pairs of like
         types and as many bonds apart, the longest of those one or two bonds apart."""
-        elements = fabric.molecule.elements
+        elements = topology.molecule.elements
         self.nearest_nm.zero_()
         self.farthest_nm.fill_(NO_WALL_NM)
-        nearest: dict[tuple[int, int, int], float] = {}
-        farthest: dict[tuple[int, int, int], float] = {}
-        for (i, j), shell in (_all_pairs(len(elements)) | fabric.shells).items():
+        extremes: dict[tuple[int, int, int], tuple[float, float]] = {}
+        for (i, j), shell in (_all_pairs(len(elements)) | topology.shells).items():
             distance = (positions_nm[:, i] - positions_nm[:, j]).norm(dim=-1)
             low, high = sorted((int(elements[i]), int(elements[j])))
-            kind = (shell, low, high)
-            nearest[kind] = min(nearest.get(kind, NO_WALL_NM), float(distance.min()))
-            farthest[kind] = max(farthest.get(kind, 0.0), float(distance.max()))
-        for (shell, low, high), shortest in nearest.items():
-            longest = farthest[shell, low, high]
-            for a, b in ((low, high), (high, low)):
-                self.nearest_nm[shell, a, b] = shortest / WALL_MARGIN
-                if shell < WALLED_SHELLS:
-                    self.farthest_nm[shell, a, b] = longest * WALL_MARGIN
+            least, most = extremes.get((shell, low, high), (NO_WALL_NM, 0.0))
+            extremes[shell, low, high] = min(least, float(distance.min())), max(most, float(distance.max()))
+        for (shell, a, b), (shortest, longest) in extremes.items():
+            self.nearest_nm[shell, [a, b], [b, a]] = shortest / WALL_MARGIN
+            if shell < WALLED_SHELLS:
+                self.farthest_nm[shell, [a, b], [b, a]] = longest * WALL_MARGIN
 
-    def prepare(self, fabric: Fabric, positions_nm: Tensor) -> EdgeWeights:
+    def prepare(self, topology: Topology, positions_nm: Tensor) -> EdgeWeights:
         """Return what depends on the molecule, and on frames `(rows, n_atoms, 3)` nm by who is near whom."""
-        edges = find_edges(fabric.shells, positions_nm, self.config.cutoff_nm)
-        elements = fabric.molecule.elements
-        z = self.surroundings(self.embed_type(elements), fabric.bonds)
+        edges = find_edges(topology.shells, positions_nm, self.config.cutoff_nm)
+        elements = topology.molecule.elements
+        z = self.surroundings(self.embed_type(elements), topology.bonds)
         of_edge = self.of_pair(torch.cat([z[edges.receiver] + self.of_shell(edges.shell), z[edges.sender]], dim=-1))
         types = edges.shell, elements[edges.receiver], elements[edges.sender]
         # An atom is as far from itself as no wall stands.
@@ -373,41 +349,39 @@ class EnergyNetwork(nn.Module):
         table = self.table(of_edge).unflatten(-1, (self.config.n_radial, -1))
         return EdgeWeights(edges, z, looks, table, self.nearest_nm[types][:, None], farthest[:, None])
 
-    def forward(self, positions_nm: Tensor, fabric: Fabric, made: EdgeWeights) -> Tensor:
+    def forward(self, positions_nm: Tensor, topology: Topology, made: EdgeWeights) -> Tensor:
         """Frames `(rows, n_atoms, 3)` nm -> energies `(rows, n_members)`."""
-        c, kind = self.config, made.of_atom.dtype
+        c, dtype = self.config, made.of_atom.dtype
         x = positions_nm.transpose(0, 1)
-        seen = measure_edges(x, made.edges, c.n_radial, c.cutoff_nm, kind)
+        seen = measure_edges(x, made.edges, c.n_radial, c.cutoff_nm, dtype)
         # Vectors in units of 0.1 nm, about the mean, before they lose digits.
-        x = ((x - x.mean(0)) * 10.0).to(kind).transpose(0, 1)
+        x = ((x - x.mean(0)) * 10.0).to(dtype).transpose(0, 1)
         h = made.of_atom[:, None].expand(-1, len(positions_nm), -1)
         carried = None
         dense = c.attention == "dense" or (c.attention == "auto" and x.shape[1] <= FEW_ATOMS)
         steps = cast(Iterable[EnergyAttention], self.steps)
         for look, step, weights in zip(self.looks, steps, made.looks, strict=True):
             h = look(h, carried, seen, made.edges, weights)
-            new, means, q = step(h.transpose(0, 1), x, fabric.molecule.elements, fabric.groups, dense=dense)
+            new, means, q = step(h.transpose(0, 1), x, topology.molecule.elements, topology.groups, dense=dense)
             h = new.transpose(0, 1)
             # (rows, n_heads, n, 3) -> (n, rows, 3, n_heads)
             carried = (means - x[:, None]).permute(2, 0, 3, 1)
         energy = self.site(h).sum(0) + 0.5 * torch.bmm(seen.radial, made.table).sum(0)
-        energy = energy + latent_energy(q, *step.type_matrices(), fabric) @ self.latent
+        energy = energy + latent_energy(q, *step.type_matrices(), topology) @ self.latent
         # The walls: zero inside, with two derivatives.
         near = torch.relu(1.0 - seen.distance_nm / made.nearest_nm.clamp(min=_LEAST_NM))
         far = torch.relu(seen.distance_nm / made.farthest_nm - 1.0)
         return energy + (WALL * (near.pow(3) + far.pow(3)).sum(0))[:, None]
 
 
-def latent_energy(q: Tensor, phi: Tensor, psi: Tensor, fabric: Fabric) -> Tensor:
-    """Return sum_ij rho_ij(|q_i - q_j|^2) / n^2 by head, `(rows, n_heads)`, in time linear in atoms.
-
-    `q` (rows, n_heads, n, d) of unit length, so that s = 2 - 2 q_i.q_j; `phi` = a - 4 b and `psi` = 4 b (n_heads,
-    n_types, n_types). Sums over pairs of types need sums of q and of q q^T over each type alone.
-    """
-    phi, psi = (m[:, fabric.present][:, :, fabric.present] for m in (phi, psi))
+def latent_energy(q: Tensor, phi: Tensor, psi: Tensor, topology: Topology) -> Tensor:
+    """Return sum_ij rho_ij(|q_i - q_j|^2) / n^2 by head, `(rows, n_heads)`, in time linear in atoms: `q` (rows,
+    n_heads, n, d) of unit length, so that s = 2 - 2 q_i.q_j; `phi` = a - 4 b and `psi` = 4 b (n_heads, n_types,
+    n_types)."""
+    phi, psi = (m[:, topology.present][:, :, topology.present] for m in (phi, psi))
     b = 0.25 * psi
     a = phi + psi
-    z = fabric.one_hot.to(q.dtype)
+    z = topology.one_hot.to(q.dtype)
     sums = torch.einsum("tn,rhnd->rhtd", z, q)
     squares = torch.einsum("tn,rhnd,rhne->rhtde", z, q, q).flatten(-2)
     first = sums @ sums.transpose(-1, -2)
@@ -418,9 +392,8 @@ def latent_energy(q: Tensor, phi: Tensor, psi: Tensor, fabric: Fabric) -> Tensor
 
 
 # The potential by SIMD: copies of a molecule at once, each in its own element of the processor's vector registers.
-# `simd.cpp` computes energies and their mean's gradient as `EnergyNetwork` and torch do, in single precision, without
-# writing what a pair of atoms sees to memory, and moves the copies by it with the bath and rigid bonds of
-# md_reference.simd. This machine's C++ compiler makes it at first use, in seconds.
+# `simd.cpp` computes energies and their mean's gradient as `EnergyNetwork` and torch do, in single precision, and moves
+# the copies by it with the bath and rigid bonds of md_reference.simd. It is compiled at first use, in seconds.
 
 _SOURCE = Path(__file__).with_name("simd.cpp")
 # Copies at once: of a whole register, and where no more are asked for; of the register in bytes.
@@ -451,13 +424,13 @@ class SimdPotential:
     gradient `(rows, n_atoms, 3)` of their mean, by the network's weights as they are now, times `unit` and from `zero`,
     both in kJ/mol."""
 
-    def __init__(self, network: EnergyNetwork, fabric: Fabric, made: EdgeWeights, unit: float, zero: float) -> None:
-        config, n = network.config, fabric.molecule.n_atoms
+    def __init__(self, network: EnergyNetwork, topology: Topology, made: EdgeWeights, unit: float, zero: float) -> None:
+        config, n = network.config, topology.molecule.n_atoms
         self.config, self.n_atoms, self.unit, self.zero = config, n, unit, zero
         self._work: dict[tuple[int, int], npt.NDArray[Any]] = {}
         # The program reads these arrays in place.
         self._kept: list[npt.NDArray[Any]] = []
-        types = fabric.molecule.elements
+        types = topology.molecule.elements
         steps = []
         looks, attentions = cast(Iterable[Look], network.looks), cast(Iterable[EnergyAttention], network.steps)
         for look, attention in zip(looks, attentions, strict=True):
@@ -494,7 +467,7 @@ class SimdPotential:
 
     @torch.no_grad()
     def __call__(self, positions_nm: Tensor) -> tuple[Tensor, Tensor]:
-        rows, width = len(positions_nm), _width(len(positions_nm))
+        rows, width = len(positions_nm), _width_for(len(positions_nm))
         x = _laid(positions_nm.double(), width)
         energy = torch.empty(len(x), self.config.n_members, width)
         gradient = torch.empty(len(x), self.n_atoms, 3, width)
@@ -511,7 +484,7 @@ class SimdPotential:
     def langevin(self, x: Tensor, v: Tensor, draw: Tensor, bath: Bath) -> tuple[Tensor, Tensor]:
         """Return positions nm and velocities nm/ps `(rows, n_atoms, 3)` after the steps that `draw` (rows, n_atoms,
         n_steps, 3) holds normal numbers for."""
-        rows, width, n_steps = len(x), _width(len(x)), draw.shape[2]
+        rows, width, n_steps = len(x), _width_for(len(x)), draw.shape[2]
         at, moving = _laid(x.double(), width), _laid(v.double(), width)
         drawn = _laid((bath.lost[..., None] * draw).transpose(1, 2).float(), width)
         # What the bath gives is drawn: no thermal speeds.
@@ -558,20 +531,20 @@ class SimdPotential:
         return _Linear(self._array(layer.weight), self._array(layer.weight.T), self._array(layer.bias))
 
 
-def simd_potential_of(network: EnergyNetwork, fabric: Fabric, made: EdgeWeights, rows: int, unit: float = 1.0,
+def simd_potential_of(network: EnergyNetwork, topology: Topology, made: EdgeWeights, rows: int, unit: float = 1.0,
                       zero: float = 0.0) -> SimdPotential | None:  # fmt: skip
     """Return the potential by SIMD, compiled for so many frames; None where it does not run so: not in single precision
     on this processor, for so many atoms that pairs change from frame to frame, or without a C++ compiler."""
     if made.of_atom.dtype != torch.float32 or made.of_atom.device.type != "cpu" or not made.edges.dense:
         return None
     try:
-        _program(network.config, _width(rows))
+        _program(network.config, _width_for(rows))
     except (CompilerError, OSError):
         return None
-    return SimdPotential(network, fabric, made, unit, zero)
+    return SimdPotential(network, topology, made, unit, zero)
 
 
-def _width(rows: int) -> int:
+def _width_for(rows: int) -> int:
     return _WIDTH if rows > _FEW else _FEW
 
 
@@ -610,11 +583,8 @@ def _aligned(n_floats: int) -> npt.NDArray[Any]:
 
 
 class PainetPotential(Potential):
-    """A scalar energy, invariant to rotations, reflections, translations and the order of like atoms, and smooth; its
-    exact gradient as forces, so that momentum, angular momentum and energy are kept.
-
-    Energies are `energy_offset_kj_mol` plus the network's times `energy_scale_kj_mol`, both of training.
-    """
+    """A scalar energy, invariant to rotations, reflections, translations and the order of like atoms, and smooth:
+    `energy_offset_kj_mol` plus the network's times `energy_scale_kj_mol`, both of training."""
 
     arch: ClassVar[str] = "painet-potential"
     config: PotentialConfig
@@ -625,58 +595,57 @@ class PainetPotential(Potential):
         self.network = EnergyNetwork(config)
         self.energy_offset_kj_mol = nn.Buffer(torch.zeros(()))
         self.energy_scale_kj_mol = nn.Buffer(torch.full((), 100.0))
-        self._known: tuple[Molecule, GradientFn] | None = None
-        self._woven: Fabric | None = None
+        self._made: tuple[Molecule, GradientFn] | None = None
+        self._topology: Topology | None = None
 
     def train(self, mode: bool = True) -> PainetPotential:
         """As any module; what was made of earlier weights is forgotten."""
-        self._known = None
+        self._made = None
         super().train(mode)
         return self
 
-    def fabric(self, molecule: Molecule) -> Fabric:
+    def topology(self, molecule: Molecule) -> Topology:
         """Return what the network needs of a molecule, made once for call after call. Raises InputError for elements
         beyond radon."""
-        if self._woven is None or self._woven.molecule is not molecule:
+        if self._topology is None or self._topology.molecule is not molecule:
             heaviest = int(molecule.elements.max())
             if heaviest >= N_TYPES:
                 raise InputError(f"PAINET has types up to atomic number {N_TYPES - 1}; this molecule holds {heaviest}.")
             with torch.inference_mode(False):
-                self._woven = Fabric.of(molecule)
-        return self._woven
+                self._topology = Topology.of(molecule)
+        return self._topology
 
     def energies(self, positions_nm: Tensor, molecule: Molecule) -> Tensor:
-        """See `Potential.energies`."""
-        return self.members(positions_nm, self.fabric(molecule))
+        return self.members(positions_nm, self.topology(molecule))
 
-    def members(self, positions_nm: Tensor, fabric: Fabric, made: EdgeWeights | None = None) -> Tensor:
+    def members(self, positions_nm: Tensor, topology: Topology, made: EdgeWeights | None = None) -> Tensor:
         """Frames `(rows, n_atoms, 3)` nm -> the members' energies `(rows, n_members)` in kJ/mol, in float64."""
-        made = made or self.network.prepare(fabric, positions_nm)
-        energy = self.network(positions_nm, fabric, made)
+        made = made or self.network.prepare(topology, positions_nm)
+        energy = self.network(positions_nm, topology, made)
         return self.energy_offset_kj_mol.double() + self.energy_scale_kj_mol.double() * energy.double()
 
-    def member_forces(self, positions_nm: Tensor, fabric: Fabric) -> Tensor:
+    def member_forces(self, positions_nm: Tensor, topology: Topology) -> Tensor:
         """Frames `(rows, n_atoms, 3)` nm -> each member's forces `(n_members, rows, n_atoms, 3)` kJ/mol/nm."""
         with torch.inference_mode(False), torch.enable_grad():
             x = positions_nm.detach().clone().requires_grad_(True)
-            totals = self.members(x, fabric).sum(0)
+            totals = self.members(x, topology).sum(0)
             return -torch.stack([torch.autograd.grad(total, x, retain_graph=True)[0] for total in totals])
 
     def gradient(self, positions_nm: Tensor, molecule: Molecule) -> GradientFn:
         """Return what computes the members' energies and their mean's gradient at frames like these: by SIMD where
         they run, else by torch."""
-        known = self._known
         # Above so many atoms pairs change from frame to frame.
-        if known is None or known[0] is not molecule or molecule.n_atoms > FEW_ATOMS or self.training:
-            fabric = self.fabric(molecule)
-            with torch.inference_mode(False), torch.no_grad():
-                made = self.network.prepare(fabric, positions_nm)
-            simd = None
-            if not self.training:
-                unit, zero = float(self.energy_scale_kj_mol), float(self.energy_offset_kj_mol)
-                simd = simd_potential_of(self.network, fabric, made, len(positions_nm), unit=unit, zero=zero)
-            self._known = known = molecule, simd or gradient_of(lambda x: self.members(x, fabric, made))
-        return known[1]
+        fixed = molecule.n_atoms <= FEW_ATOMS and not self.training
+        if fixed and self._made is not None and self._made[0] is molecule:
+            return self._made[1]
+        topology, simd = self.topology(molecule), None
+        with torch.inference_mode(False), torch.no_grad():
+            made = self.network.prepare(topology, positions_nm)
+        if not self.training:
+            unit, zero = float(self.energy_scale_kj_mol), float(self.energy_offset_kj_mol)
+            simd = simd_potential_of(self.network, topology, made, len(positions_nm), unit=unit, zero=zero)
+        self._made = molecule, simd or gradient_of(lambda x: self.members(x, topology, made))
+        return self._made[1]
 
     def langevin(self, x: Tensor, v: Tensor, molecule: Molecule, masses: Tensor, thermal: Tensor, draw: Tensor, *,
                  timestep_ps: float | None = None) -> tuple[Tensor, Tensor]:  # fmt: skip

@@ -5,9 +5,11 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import combinations
 from pathlib import Path
 from typing import Any, ClassVar
 
+import networkx as nx
 import numpy as np
 import torch
 from torch import Tensor, nn
@@ -17,15 +19,15 @@ from surrogate.data import References, TrainingFrames
 from surrogate.models import architecture as arch
 from surrogate.models.architecture import ModelConfig
 from surrogate.models.propagator import Chunk, Molecule, Propagator
-from surrogate.models.weights import Weights, provenance_of, save_weights, training_domain
+from surrogate.models.weights import provenance_of, save_weights, training_domain
 from surrogate.training.loop import ProgressFn, Stage, StageConfig, train_stages
 from systems.errors import InputError
 from systems.units import GAS_CONSTANT_KJ_MOL_K
 
-# Energy-descent all-pair attention with type matrices, dense and factored.
-# With rho_ij(s) = a_ij s - b_ij s^2 and embeddings of unit length, rho'(|h_i - h_j|^2) = phi_ij + psi_ij h_i.h_j, where
-# phi = a - 4 b and psi = 4 b (papers/PAINET, "Particle-type Adaptive Mapping"). The attention's mean over all particles
-# with these weights is a descent step of the energy sum_ij rho_ij(|h_i - h_j|^2).
+# Energy-descent all-pair attention with type matrices, dense and factored (papers/PAINET, "Particle-type Adaptive
+# Mapping"). With rho_ij(s) = a_ij s - b_ij s^2 and embeddings of unit length, rho'(|h_i - h_j|^2) = phi_ij + psi_ij
+# h_i.h_j, where phi = a - 4 b and psi = 4 b. The attention's mean over all particles with these weights is a descent
+# step of the energy sum_ij rho_ij(|h_i - h_j|^2).
 
 # Index lists of each type's atoms: what the factored form sums over.
 TypeGroups = list[Tensor]
@@ -59,6 +61,14 @@ def linear_mean(q: Tensor, k: Tensor, v: Tensor, phi: Tensor, psi: Tensor, group
     for a, group in enumerate(groups):
         out[..., group, :] = plain[..., a, None, :] + q[..., group, :] @ turned[..., a, :, :]
     return out[..., :-1] / out[..., -1:]
+
+
+def check_attention(config: Any, forms: tuple[str, ...]) -> None:
+    """Raise InputError for settings of the attention that are none: `attention`, `step` and `psi_limit`."""
+    if config.attention not in forms:
+        raise InputError(f"attention = {config.attention!r} is unknown; choose {', '.join(forms)}.")
+    if not 0.0 < config.step < 1.0 or not 0.0 <= config.psi_limit < 1.0:
+        raise InputError(f"step = {config.step:g} and psi_limit = {config.psi_limit:g} must lie between 0 and 1.")
 
 
 class EnergyAttention(nn.Module):
@@ -128,33 +138,21 @@ class Graph:
     degree: Tensor
 
 
+def bond_paths(molecule: Molecule, longest: int) -> dict[tuple[int, int], int]:
+    """Return how many bonds lie between atoms (i, j), i < j, where they are at most `longest`."""
+    paths = nx.all_pairs_shortest_path_length(nx.Graph(molecule.bonds.tolist()), cutoff=longest)
+    return {(i, j): n for i, ends in paths for j, n in ends.items() if i < j}
+
+
 def molecular_graph(molecule: Molecule, *, all_pairs: bool = False) -> Graph:
     """Return bonds and pairs two bonds apart (the edges of EGNO, Xu 2024), in time linear in the atoms; with
     `all_pairs` every other pair as well."""
-    n_atoms, device = molecule.n_atoms, molecule.elements.device
-    bonds = torch.cat([molecule.bonds, molecule.bonds.flip(1)])
-    bonds = bonds[bonds[:, 0].argsort(stable=True)]
-    second = bonds.new_zeros((0, 2))
-    if len(bonds):
-        n_bonds = torch.bincount(bonds[:, 0], minlength=n_atoms)
-        first = torch.cumsum(n_bonds, 0) - n_bonds
-        # Every bond (i, j) is followed by each bond (j, k).
-        reach = n_bonds[bonds[:, 1]]
-        start = torch.repeat_interleave(bonds[:, 0], reach)
-        step = torch.arange(int(reach.sum()), device=device) - torch.repeat_interleave(reach.cumsum(0) - reach, reach)
-        end = bonds[torch.repeat_interleave(first[bonds[:, 1]], reach) + step, 1]
-        second = torch.stack([start, end], 1)[start != end]
-    pairs = [bonds, second]
-    if all_pairs:
-        index = torch.arange(n_atoms, device=device)
-        full = torch.cartesian_prod(index, index)
-        pairs.append(full[full[:, 0] != full[:, 1]])
-    kinds = torch.cat([torch.full((len(p),), kind, device=device) for kind, p in enumerate(pairs)])
-    keys = torch.cat([p[:, 0] * n_atoms + p[:, 1] for p in pairs])
-    # A pair of several kinds counts as the closest: a three-membered ring's bonds are bonds.
-    unique, place = torch.unique(keys, return_inverse=True)
-    kind = torch.full((len(unique),), N_KINDS, device=device).scatter_reduce(0, place, kinds, "amin")
-    receiver, sender = unique // n_atoms, unique % n_atoms
+    n_atoms = molecule.n_atoms
+    pairs = dict.fromkeys(combinations(range(n_atoms), 2), NOT_BONDED) if all_pairs else {}
+    pairs |= {pair: BOND if n == 1 else SECOND_NEIGHBOUR for pair, n in bond_paths(molecule, 2).items()}
+    both = sorted([(i, j, k) for (i, j), k in pairs.items()] + [(j, i, k) for (i, j), k in pairs.items()])
+    edges = torch.tensor(both, dtype=torch.int64, device=molecule.elements.device).reshape(-1, 3)
+    receiver, sender, kind = edges.T.contiguous()
     return Graph(receiver, sender, kind, torch.bincount(receiver, minlength=n_atoms).clamp(min=1))
 
 
@@ -233,8 +231,7 @@ MESSAGE_NUMBERS = 2_000_000
 
 @dataclass(frozen=True)
 class PainetConfig(ModelConfig):
-    """Size, horizon and physics. `n_new` frames are predicted at once, `frame_stride` reference frames apart: 1 frame
-    at a large stride is state-to-state, several are state-to-trajectory.
+    """Size, horizon and physics. `n_new` frames are predicted at once, `frame_stride` reference frames apart.
 
     `attention` 'linear' (factored over types, cost linear in atoms), 'dense' (the same numbers, quadratic) or 'none'
     (the decoder alone, which is EGNN). `lag_ps` between predicted frames, `temperature_k` and `friction_per_ps` of the
@@ -258,13 +255,10 @@ class PainetConfig(ModelConfig):
     friction_per_ps: float = 1.0
 
     def __post_init__(self) -> None:
-        if self.attention not in ("linear", "dense", "none"):
-            raise InputError(f"attention = {self.attention!r} is unknown; choose linear, dense or none.")
+        check_attention(self, ("linear", "dense", "none"))
         for name in ("n_new", "frame_stride", "n_decoder_layers"):
             if getattr(self, name) < 1:
                 raise InputError(f"{name} = {getattr(self, name)} must be at least 1.")
-        if not 0.0 < self.step < 1.0 or not 0.0 <= self.psi_limit < 1.0:
-            raise InputError(f"step = {self.step:g} and psi_limit = {self.psi_limit:g} must lie between 0 and 1.")
 
     @property
     def chunk_ps(self) -> float:
@@ -290,7 +284,7 @@ class Painet(Propagator):
     """X0, V0 -> X(1..T) and V(T), equivariant to rotations, reflections, translations and atom order.
 
     Embeddings start from invariants of the state: element, speed, distance to the centre of mass and the angle between
-    the two. A learned vector per frame tells the decoder which one it decodes. Velocities are learned in units of
+    the two. A learned vector per frame says which one is decoded. Velocities are learned in units of
     `velocity_scale_nm_ps`; `reach` (2,) is what positions and velocities change by over a chunk, in the model's units:
     both are measured on the training frames. The centre of mass moves on at its velocity, exactly: only the motion
     about it is learned.
@@ -399,10 +393,9 @@ class EgnnForecaster(Painet):
 @dataclass(frozen=True)
 class PainetTraining:
     """The optimisation. `noise`: standard deviation of what is added to the state a training window starts from, as a
-    share of what positions and velocities change by over a chunk, so that the model learns to come back from its own
-    errors (Sanchez-Gonzalez 2020). `pushforward`: share of windows that start where the model itself arrives after one
-    chunk from the reference, with no gradient through that chunk (Brandstetter 2022). `velocity_weight`: of the last
-    frame's velocity beside the positions, each in units of its own change over a chunk."""
+    share of what positions and velocities change by over a chunk (Sanchez-Gonzalez 2020). `pushforward`: share of
+    windows that start where the model itself arrives after one chunk from the reference, with no gradient through that
+    chunk (Brandstetter 2022). `velocity_weight`: of the last frame's velocity beside the positions."""
 
     budget_s: float | None = None
     steps: int | None = None
@@ -433,22 +426,11 @@ def for_frames(config: PainetConfig, frames: TrainingFrames) -> PainetConfig:
 
 
 def train_painet(
-    frames: TrainingFrames,
-    out: str | Path,
-    model_config: PainetConfig,
-    config: PainetTraining,
-    *,
-    model_class: type[Painet] = Painet,
-    start: Weights | None = None,
-    resume: bool = False,
-    progress: ProgressFn | None = None,
-) -> Path:
-    """Train on `frames`, which carry velocities, and write `out` (.safetensors) with a CSV of the curves beside it.
-
-    `start`: weights of the same configuration that the training begins from, with their scales.
-
-    Raises InputError when the frames carry none or are too short, SimulationError when training diverges.
-    """
+    frames: TrainingFrames, out: str | Path, model_config: PainetConfig, config: PainetTraining, *,
+    model_class: type[Painet] = Painet, resume: bool = False, progress: ProgressFn | None = None,
+) -> Path:  # fmt: skip
+    """Train on `frames` and write `out` (.safetensors) with a CSV of the curves beside it. Raises InputError when they
+    carry no velocities or are too short, SimulationError when training diverges."""
     out = Path(out)
     if frames.velocities is None:
         raise InputError(f"{model_class.arch} learns from velocities; these frames carry none.")
@@ -459,10 +441,6 @@ def train_painet(
     structure = model.structure(model.featurise(frames.scene).to(device))
     windows = StateWindows(frames, model_config, device)
     model.set_scales(windows.velocity_scale_nm_ps, windows.position_scale_nm, windows.change_scale_nm_ps)
-    if start is not None:
-        if start.model.config != model_config:
-            raise InputError(f"{start.path} is of another configuration, {start.model.config}, than {model_config}.")
-        model.load_state_dict(start.model.state_dict())
     stage = StageConfig("forecast", config.batch, config.learning_rate, config.budget_s, config.steps,
                         seed=config.seed, bf16=config.bf16, validate_every_s=config.validate_every_s)  # fmt: skip
     domain = training_domain(frames, stride=model_config.frame_stride)
@@ -477,7 +455,7 @@ def train_painet(
     def write(spent_s: list[float]) -> None:
         settings = {"seed": config.seed, "noise": config.noise, "pushforward": config.pushforward,
                     "training_s": round(sum(spent_s), 1)}  # fmt: skip
-        save_weights(out, model, domain, provenance_of(frames.origin, settings, start))
+        save_weights(out, model, domain, provenance_of(frames.origin, settings))
 
     stages = [Stage(model, stage, loss_fn, validate)]
     train_stages(stages, out, write, device=device, resume=resume, progress=progress)
@@ -485,12 +463,9 @@ def train_painet(
 
 
 class StateWindows:
-    """States and their futures, cut from frames: two chunks long, so that a pushforward has a reference to compare
-    with.
-
+    """States and their futures, cut from frames: two chunks long, so that a pushforward has a reference.
     `position_scale_nm`, `change_scale_nm_ps`: root mean square displacement and change of velocity over a chunk, what
-    errors are measured in; `velocity_scale_nm_ps`: root mean square velocity.
-    """
+    errors are measured in; `velocity_scale_nm_ps`: root mean square velocity."""
 
     def __init__(self, frames: TrainingFrames, config: PainetConfig, device: torch.device) -> None:
         assert frames.velocities is not None

@@ -1,8 +1,5 @@
-"""Training of PAINET as a potential, by active learning from an expensive reference.
-
-States come from hot MD and turned torsions (the labeller's `explore`), then from the model's own rollouts. Members of
-the potential learn from different samples; states where their forces spread most are labelled next.
-"""
+"""Training of PAINET as a potential, by active learning from an expensive reference. States come from hot MD and turned
+torsions, then from the model's own rollouts; those where the forces of its members spread most are labelled next."""
 
 from __future__ import annotations
 
@@ -10,7 +7,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, NoReturn, Protocol
 
 import numpy as np
 import torch
@@ -50,13 +47,9 @@ class Samples:
 
     def joined(self, other: Samples) -> Samples:
         """Return both, without what lies too high above the lowest."""
-        parts = (np.concatenate([getattr(self, f.name), getattr(other, f.name)]) for f in fields(Samples))
-        return (together := Samples(*parts)).plausible(together)
-
-    def plausible(self, others: Samples) -> Samples:
-        """Return those of the others that a rollout may visit, by how far they lie above the lowest of these."""
-        highest = self.energies_kj_mol.min(initial=np.inf) + _HIGHEST_KJ_MOL * self.positions_nm.shape[1]
-        return others.where(others.energies_kj_mol < highest)
+        both = Samples(*(np.concatenate([getattr(self, f.name), getattr(other, f.name)]) for f in fields(Samples)))
+        highest = both.energies_kj_mol.min(initial=np.inf) + _HIGHEST_KJ_MOL * both.positions_nm.shape[1]
+        return both.where(both.energies_kj_mol < highest)
 
     def where(self, chosen: Any) -> Samples:
         """Return those that are chosen, by a mask or by numbers."""
@@ -106,8 +99,8 @@ def domain_of(scene: Scene, samples: Samples, moving: list[Any], config: Potenti
     return TrainingDomain(scene, config.lag_ps, conditions, geometry.to_dict(), limits.to_dict(), ())
 
 
-# The share of the budget in which states are labelled; what is missing then is labelled at once, unless a pause or a
-# resumption has brought the training so far that it would hardly learn them.
+# The share of the budget in which states are labelled; what is missing then is labelled at once, unless a resumption
+# comes so late that it would hardly learn them.
 _LABELLING_SHARE, _LAST_LABELLING_SHARE = 0.4, 0.7
 # Most of the budget that new states and their answers may take.
 _LABELLING_TIME_SHARE = 0.3
@@ -188,8 +181,8 @@ class Learner:
     ) -> None:
         self.model, self.reference, self.config = model, reference, config
         self.molecule = Molecule.of(reference.scene)
-        self.fabric = model.fabric(self.molecule)
-        self.path, self.rounds_path = samples_path(out), out.with_name(f"{out.stem}.rounds.csv")
+        self.topology = model.topology(self.molecule)
+        self.path = samples_path(out)
         self.key = reference.scene.topology_hash
         self.samples = Samples.none(reference.scene.n_atoms)
         self.error_kj_mol_nm = np.inf
@@ -201,8 +194,6 @@ class Learner:
             self._spent_s, self._steps = float(rows[-1]["spent_s"]), int(rows[-1]["step"])
         if resume and self.path.exists():
             self.samples = Samples.load(self.path, self.key)
-        else:
-            self.rounds_path.unlink(missing_ok=True)
         self._budget_s, self._started = config.budget_s, time.monotonic()
         self._labelling = True
         self._labelling_s, self._labelled = 0.0, 0
@@ -244,7 +235,7 @@ class Learner:
         member = torch.multinomial(self._bags[k], 1, generator=generator)[:, 0]
         at = x[k].requires_grad_(True)
         with torch.autocast(at.device.type, enabled=False):
-            found = model.members(at, self.fabric).gather(1, member[:, None])[:, 0]
+            found = model.members(at, self.topology).gather(1, member[:, None])[:, 0]
             (gradient,) = torch.autograd.grad(found.sum(), at, create_graph=True)
         scale = model.energy_scale_kj_mol.double()
         wrong = (gradient + forces[k]) / (10.0 * scale)
@@ -253,27 +244,24 @@ class Learner:
         return force + c.energy_weight * energy, {"force": force.detach(), "energy": energy.detach()}
 
     def errors(self) -> dict[str, float]:
-        """Errors on held-out states: of forces in kJ/mol/nm, mean absolute and root mean square, beside the mean
-        absolute force, and of energies (less their mean) in kJ/mol, beside the members' spread there; how many states
-        have been labelled."""
+        """Errors on held-out states, of forces in kJ/mol/nm and of energies (less their mean) in kJ/mol; how many
+        states have been labelled."""
         numbers = np.flatnonzero(self.samples.held)
         some = np.linspace(0, len(numbers) - 1, min(len(numbers), _MEASURED)).astype(int)
-        held = self.samples.where(numbers[some])
-        found = self._measured(held)
-        self.error_kj_mol_nm = found["force_mae"]
-        return {f"validation_{k}": v for k, v in found.items()} | {"evaluations": float(len(self.samples))}
-
-    def _measured(self, samples: Samples) -> dict[str, float]:
-        x, energies, forces = samples.tensors()
+        x, energies, forces = self.samples.where(numbers[some]).tensors()
         parts = [self.model.evaluate(part, self.molecule) for part in x.split(256)]
         wrong = torch.cat([part.forces_kj_mol_nm for part in parts]) - forces
         off = torch.cat([part.energy_kj_mol for part in parts]) - energies
+        self.error_kj_mol_nm = float(wrong.abs().mean())
         return {
-            "force_mae": float(wrong.abs().mean()),
-            "force_rms": float(wrong.square().mean().sqrt()),
-            "mean_force": float(forces.abs().mean()),
-            "energy_mae": float((off - off.mean()).abs().mean()),
-            "energy_spread": float(torch.cat([part.members_kj_mol for part in parts]).std(-1, correction=0).mean()),
+            "validation_force_mae": self.error_kj_mol_nm,
+            "validation_force_rms": float(wrong.square().mean().sqrt()),
+            "validation_mean_force": float(forces.abs().mean()),
+            "validation_energy_mae": float((off - off.mean()).abs().mean()),
+            "validation_energy_spread": float(
+                torch.cat([part.members_kj_mol for part in parts]).std(-1, correction=0).mean()
+            ),
+            "evaluations": float(len(self.samples)),
         }
 
     def _label_if_due(self, generator: torch.Generator) -> None:
@@ -307,14 +295,14 @@ class Learner:
         rest = pool[order[n // 2 :]]
         spread = self.spread(torch.from_numpy(rest))
         unsure = rest[np.argsort(-spread)[: n - len(any_)]]
-        self._label(any_, held=2 * self.config.held_share, measured=True)
+        self._label(any_, held=2 * self.config.held_share)
         self._label(unsure, held=0.0)
         self._labelling_s, self._labelled = self._labelling_s + time.monotonic() - began, self._labelled + n
 
     def spread(self, positions_nm: Tensor) -> Any:
         """Root mean square deviation of the members' forces from their mean, the largest of each state's atoms, `(n,)`
         in kJ/mol/nm."""
-        parts = [self.model.member_forces(part, self.fabric) for part in positions_nm.double().split(256)]
+        parts = [self.model.member_forces(part, self.topology) for part in positions_nm.double().split(256)]
         deviation = torch.cat([(p - p.mean(0)).square().sum(-1).mean(0).sqrt().amax(-1) for p in parts])
         return torch.nan_to_num(deviation, nan=0.0).numpy()
 
@@ -340,8 +328,8 @@ class Learner:
         found = torch.cat(frames)
         return found[torch.isfinite(found).all(-1).all(-1) & (found.abs().amax((1, 2)) < 10.0)].numpy()
 
-    def _label(self, states: Any, *, held: float, measured: bool = False) -> None:
-        """Label states and learn from them; `measured`: note the error before."""
+    def _label(self, states: Any, *, held: float) -> None:
+        """Label states, of which a share is `held` out, and learn from them."""
         answers = self.reference.label(states)
         n = len(answers.energies_kj_mol)
         if not n:
@@ -350,9 +338,6 @@ class Learner:
             return
         kept = np.arange(n) < round(held * n)
         new = Samples(answers.positions_nm, answers.energies_kj_mol, answers.forces_kj_mol_nm, kept)
-        if measured:
-            row = {"evaluations": len(self.samples), "share": self.share, **self._measured(self.samples.plausible(new))}
-            loop.append_row(self.rounds_path, row)
         self.samples = self.samples.joined(new)
         self.samples.save(self.path, self.key)
         self._use()
@@ -366,7 +351,7 @@ class Learner:
         draw = torch.rand(len(learned), members, generator=torch.Generator().manual_seed(1))
         # Each sample is somebody's.
         self._bags = ((draw < _BAG) | (draw == draw.amin(1, keepdim=True))).float()
-        self.model.network.set_walls(self._tensors[0], self.fabric)
+        self.model.network.set_walls(self._tensors[0], self.topology)
 
 
 def samples_path(out: Path) -> Path:
@@ -378,9 +363,8 @@ def learn_potential(
     reference: ReferenceForces, out: Path, model_config: PotentialConfig, config: PotentialTraining, *,
     resume: bool = False, progress: loop.ProgressFn | None = None, before_s: float = 0.0, after_s: float = 0.0,
 ) -> Path:  # fmt: skip
-    """Learn a molecule's energies and forces and write weights `out`; beside them stay the samples, the curves (.csv)
-    and the error of forces against evaluations, round by round (NAME.rounds.csv). Of the budget `before_s` are spent
-    already, and `after_s` are wanted by the caller, for later."""
+    """Learn a molecule's energies and forces and write weights `out`; beside them stay the samples and the curves
+    (.csv). Of the budget `before_s` are spent already, and `after_s` are wanted by the caller, for later."""
     began = time.monotonic() - before_s
     torch.manual_seed(config.seed)
     model = PainetPotential(model_config)
@@ -397,9 +381,10 @@ def learn_potential(
     if budget_s is not None:
         left_s = budget_s - (time.monotonic() - began) - after_s
         budget_s = max(left_s, _LEARNING_SHARE * budget_s)
-    stage = loop.StageConfig("potential", config.batch, config.learning_rate, budget_s, config.steps,
-                        matrix_rate=config.matrix_rate, seed=config.seed, bf16=False,
-                        validate_every_s=config.validate_every_s)  # fmt: skip
+    stage = loop.StageConfig(
+        "potential", config.batch, config.learning_rate, budget_s, config.steps, matrix_rate=config.matrix_rate,
+        seed=config.seed, bf16=False, validate_every_s=config.validate_every_s,
+    )  # fmt: skip
 
     def advance(name: str, share: float, metrics: dict[str, float]) -> None:
         error = f", force error {learner.error_kj_mol_nm:.3g} kJ/mol/nm" if np.isfinite(learner.error_kj_mol_nm) else ""
@@ -424,16 +409,18 @@ def learn_potential(
 class PotentialTrainer(arch.Trainer):
     """Refuses trajectories, which say too little about forces; `learn` takes a molecule and its reference."""
 
-    def check(self, request: arch.TrainingRequest) -> None:
-        raise _no_trajectories(request)
+    def check(self, request: arch.TrainingRequest) -> NoReturn:
+        raise InputError(
+            f"{request.arch} learns from forces that are computed for it; give a molecule, `arch='painet'` and "
+            "`level='gfn2-xtb'`."
+        )
 
     def settings(self, request: arch.TrainingRequest) -> arch.Settings:
-        """See `Trainer.settings`."""
         training = request.settings(PotentialTraining)
         return arch.Settings(PotentialConfig.from_dict(request.model), training, arch.RESOLVED)
 
     def prepare(self, references: References, request: arch.TrainingRequest) -> arch.Prepared:
-        raise _no_trajectories(request)
+        self.check(request)
 
     def learn(self, reference: ReferenceForces, request: arch.TrainingRequest, advance: Callable[[str, float], None], *,
               before_s: float = 0.0, after_s: float = 0.0) -> Path:  # fmt: skip
@@ -443,13 +430,6 @@ class PotentialTrainer(arch.Trainer):
             reference, request.out, settings.model, settings.training, resume=request.resume,
             progress=lambda stage, share, metrics: advance(stage, share), before_s=before_s, after_s=after_s,
         )  # fmt: skip
-
-
-def _no_trajectories(request: arch.TrainingRequest) -> InputError:
-    return InputError(
-        f"{request.arch} learns from forces that are computed for it; give a molecule, `arch='painet'` and "
-        "`level='gfn2-xtb'`."
-    )
 
 
 PAINET_POTENTIAL = arch.Architecture("painet-potential", PotentialConfig.from_dict, PainetPotential, PotentialTrainer)

@@ -3,12 +3,10 @@
 Every atom is placed by a bond length, a bond angle and a dihedral on three atoms before it (Parsons et al., J. Comput.
 Chem. 26, 1063 (2005)), from a root in the first residue onwards. One dihedral about each bond that can turn is the
 torsion, given by cosine and sine; the others about that bond by how far they are from it. These, lengths and angles
-hardly vary: they are in standard deviations from their mean, which the data of all peptides give for each residue type,
-and those that references hold rigid are constants. An atom that closes a ring is placed by the lengths of both its
-bonds in the ring instead of by an angle. Whatever numbers a network returns, every frame is one of the right molecule
-with bonds, angles and handedness as MD has them, and no error grows with chain length.
-
-Each number belongs to one residue and has a place (slot) in that residue's token, the same for every residue of a type.
+hardly vary: they are in standard deviations from the mean of their residue type, and those that references hold rigid
+are constants. An atom that closes a ring is placed by the lengths of both its bonds in the ring instead of by an angle.
+Whatever numbers a network returns, bonds, angles and handedness are as MD has them, and no error grows with chain
+length. Each number has a place (slot) in its residue's token, the same for every residue of a type.
 """
 
 from __future__ import annotations
@@ -39,10 +37,10 @@ class ChainLayout:
 
     `root`: three bonded atoms. `placed`: rows (atom, b, c, d), each after those that it is placed by. `closing`: rows
     whose atom is bonded to c as well as to b, and which is placed by that length instead of an angle. `primary`: for
-    each row the row whose dihedral its own is counted from (itself where it stands alone). `residue_of`: of the
-    coordinates, three for the root (two lengths, an angle) and three for each row (length, angle or other length,
-    dihedral), the residue they belong to; `keys`: their names, equal for residues of one type and for free ends;
-    `kinds`: STIFF, TURNING or RIGID. `types`: of the residues, by name.
+    each row the row whose dihedral its own is counted from (itself where it stands alone). Of the coordinates, three
+    for the root (two lengths, an angle) and three for each row (length, angle or other length, dihedral):
+    `residue_of`, the residue they belong to; `keys`, their names, equal for residues of one type and for free ends;
+    `motions`, STIFF, TURNING or RIGID. `types`: of the residues, by name.
     """
 
     n_atoms: int
@@ -52,13 +50,32 @@ class ChainLayout:
     primary: tuple[int, ...]
     residue_of: tuple[int, ...]
     keys: tuple[str, ...]
-    kinds: tuple[int, ...]
+    motions: tuple[int, ...]
     types: tuple[str, ...]
+
+    @cached_property
+    def tables(self) -> tuple[Tensor, Tensor, Tensor]:
+        """`placed` (n, 4), `closing` (n,) and `primary` (n,) as tensors."""
+        with torch.inference_mode(False):  # gradients may be taken through frames that follow from them
+            rows = torch.tensor(self.placed, dtype=torch.long).reshape(-1, 4)
+            return rows, torch.tensor(self.closing, dtype=torch.bool), torch.tensor(self.primary, dtype=torch.long)
+
+    @cached_property
+    def levels(self) -> list[list[int]]:
+        """Rows of `placed` in groups that can be placed at once, one after the other."""
+        level_of = dict.fromkeys(self.root, 0)
+        found: list[list[int]] = []
+        for k, (atom, *refs) in enumerate(self.placed):
+            level_of[atom] = 1 + max(level_of[i] for i in refs)
+            while len(found) < level_of[atom]:
+                found.append([])
+            found[level_of[atom] - 1].append(k)
+        return found
 
     @property
     def turning(self) -> list[tuple[int, int, int, int]]:
         """The rows of `placed` whose dihedral is a torsion."""
-        return [row for k, row in enumerate(self.placed) if self.kinds[3 + 3 * k + 2] == TURNING]
+        return [row for k, row in enumerate(self.placed) if self.motions[3 + 3 * k + 2] == TURNING]
 
 
 @dataclass(frozen=True)
@@ -81,31 +98,26 @@ class ChainCode(nn.Module):
     def __init__(self, layout: ChainLayout, scale: ChainScale) -> None:
         super().__init__()
         self.layout, self.n_slots, self.n_residues = layout, scale.n_slots, len(layout.types)
-        kinds = torch.tensor(layout.kinds)
-        at = torch.tensor(layout.residue_of) * self.n_slots
+        stiff, turning = (torch.tensor([motion == one for motion in layout.motions]) for one in (STIFF, TURNING))
         slots = torch.tensor([scale.slots.get(key, 0) for key in layout.keys])
-        stiff, turning = kinds == STIFF, kinds == TURNING
+        at = torch.tensor(layout.residue_of) * self.n_slots + slots
         fixed = partial(nn.Buffer, persistent=False)
-        mean, deviation = (
-            [of.get(key, d) for key in layout.keys] for of, d in ((scale.mean, 0.0), (scale.deviation, 1.0))
-        )
-        self.rows = fixed(torch.tensor(layout.placed, dtype=torch.long).reshape(-1, 4))
-        self.closing = fixed(torch.tensor(layout.closing, dtype=torch.bool))
-        self.primary = fixed(torch.tensor(layout.primary, dtype=torch.long))
-        self.mean = fixed(torch.tensor(mean, dtype=torch.float64))
+        self.mean = fixed(torch.tensor([scale.mean.get(key, 0.0) for key in layout.keys], dtype=torch.float64))
+        deviation = [scale.deviation.get(key, 1.0) for key in layout.keys]
         self.deviation = fixed(torch.tensor(deviation, dtype=torch.float64))
         self.stiff, self.turning = fixed(stiff.nonzero()[:, 0]), fixed(turning.nonzero()[:, 0])
-        self.stiff_at, self.turning_at = fixed((at + slots)[stiff]), fixed((at + slots)[turning])
-        filled = torch.zeros(self.n_residues * self.n_slots, dtype=torch.bool)
-        filled[self.stiff_at] = True
-        filled[self.turning_at] = True
-        filled[self.turning_at + 1] = True
-        self.filled = nn.Buffer(filled.reshape(self.n_residues, self.n_slots), persistent=False)
-        self.levels = _levels(layout)
+        self.stiff_at, self.turning_at = fixed(at[stiff]), fixed(at[turning])
+        places = torch.zeros(2, self.n_residues * self.n_slots, dtype=torch.bool)
+        places[0, self.stiff_at] = True
+        places[1, torch.cat([self.turning_at, self.turning_at + 1])] = True
+        # Places with stiff numbers and with those of torsions, `(n_residues, n_slots)`; and both.
+        filled_stiff, filled_turning = places.unflatten(1, (self.n_residues, self.n_slots))
+        self.filled_stiff, self.filled_turning = fixed(filled_stiff), fixed(filled_turning)
+        self.filled = nn.Buffer(filled_stiff | filled_turning, persistent=False)
 
     def encode(self, frames: Tensor) -> Tensor:
         """Frames `(..., n_atoms, 3)` nm -> tokens `(..., n_residues, n_slots)`, zero in empty places; float32."""
-        values = internal_coordinates(frames.double(), self.layout.root, self.rows, self.closing, self.primary)
+        values = internal_coordinates(frames.double(), self.layout)
         tokens = frames.new_zeros(*frames.shape[:-2], self.n_residues * self.n_slots, dtype=torch.float64)
         stiff = values[..., self.stiff] - self.mean[self.stiff]
         # Dihedrals are angles: the nearest way round. Lengths and bond angles never differ by half a turn.
@@ -125,22 +137,23 @@ class ChainCode(nn.Module):
         return self._place(values).float()
 
     def _place(self, values: Tensor) -> Tensor:
+        rows, closing, primary = (table.to(values.device) for table in self.layout.tables)
         lengths, angles, dihedrals = (values[..., 3 + k :: 3] for k in range(3))
-        own = torch.arange(len(self.primary), device=values.device) == self.primary
-        dihedrals = torch.where(own, dihedrals, dihedrals + dihedrals[..., self.primary])
+        own = torch.arange(len(primary), device=values.device) == primary
+        dihedrals = torch.where(own, dihedrals, dihedrals + dihedrals[..., primary])
         x = values.new_zeros(*values.shape[:-1], self.layout.n_atoms, 3)
         a, _, c = self.layout.root
         # The middle atom of the root in the origin, the first on the x axis, the third in the plane.
         x[..., a, 0] = values[..., 0]
         x[..., c, 0] = values[..., 1] * values[..., 2].cos()
         x[..., c, 1] = values[..., 1] * values[..., 2].sin()
-        for level in self.levels:
+        for level in self.layout.levels:
             which = torch.tensor(level, device=values.device)
-            atom, b_, c_, d_ = self.rows[which].T
+            atom, b_, c_, d_ = rows[which].T
             length, angle = lengths[..., which], angles[..., which]
-            if self.closing[which].any():
+            if closing[which].any():
                 met = _angle_between(length, (x[..., b_, :] - x[..., c_, :]).norm(dim=-1), opposite=angle)
-                angle = torch.where(self.closing[which], met, angle)
+                angle = torch.where(closing[which], met, angle)
             x[..., atom, :] = extend(x[..., d_, :], x[..., c_, :], x[..., b_, :], length, angle, dihedrals[..., which])
         return x
 
@@ -157,7 +170,7 @@ FIRST_OF_SIDE_CHAIN = 2
 # Where the first state begins and where the next ones do, counted from there, degrees: phi (negative, positive), psi
 # (strands, helices), a bond between tetrahedral atoms (gauche+, trans, gauche-), one to an aromatic ring (its sides).
 # Psi's barrier lies elsewhere before a proline, whose ring is in the way of helices.
-Kind = tuple[float, tuple[float, float]]
+StateBounds = tuple[float, tuple[float, float]]
 PHI = (POSITIVE_PHI_DEG[1], (360.0 - POSITIVE_PHI_DEG[1], 360.0))
 PSI = (75.0, (165.0, 360.0))
 PSI_BEFORE_PROLINE = (25.0, (215.0, 360.0))
@@ -178,11 +191,11 @@ class StatedTorsions:
     n_residues: int
 
     @staticmethod
-    def of(rows: list[tuple[list[int], int, int, Kind]], n_residues: int) -> StatedTorsions:
+    def of(rows: list[tuple[list[int], int, int, StateBounds]], n_residues: int) -> StatedTorsions:
         """Return those of `rows`: four atoms, residue, slot, and PHI, PSI, THREEFOLD or RING."""
         quads, residue, slot = (torch.tensor([row[k] for row in rows], dtype=torch.long) for k in range(3))
-        first = torch.tensor([kind[0] for *_, kind in rows])
-        edges = torch.tensor([kind[1] for *_, kind in rows]).reshape(-1, MOST_STATES - 1)
+        first = torch.tensor([bounds[0] for *_, bounds in rows])
+        edges = torch.tensor([bounds[1] for *_, bounds in rows]).reshape(-1, MOST_STATES - 1)
         return StatedTorsions(quads.reshape(-1, 4), residue, slot, first, edges, n_residues)
 
     def to(self, device: torch.device) -> StatedTorsions:
@@ -241,10 +254,11 @@ class ChainFeatures:
         places, least_nm = self.places.to(device), self.least_nm.to(device)
         return replace(self, code=code, places=places, stated=self.stated.to(device), least_nm=least_nm)
 
-    @cached_property
-    def signed(self) -> Tensor:
-        """The residues `(n,)` whose phi has two sides."""
-        return self.stated.residue[self.stated.slot == 0]
+    @property
+    def signed(self) -> list[int]:
+        """The residues whose phi has two sides, but those before a proline, whose ring leaves them no room."""
+        types, residues = (*self.code.layout.types, ""), self.stated.residue[self.stated.slot == 0].tolist()
+        return [residue for residue in residues if types[residue + 1] != "PRO"]
 
     @cached_property
     def stated_at(self) -> Tensor:
@@ -260,6 +274,12 @@ class ChainFeatures:
         found = torch.full_like(self.code.filled, -1, dtype=torch.long).flatten()
         found[self.stated_at] = found[self.stated_at + 1] = self.stated.slot
         return found.reshape(self.code.filled.shape)
+
+    def state_of_numbers(self, states: Tensor) -> Tensor:
+        """`states` (..., n_residues, MOST_TORSIONS) of torsions -> that of each number's torsion, `(..., n_residues,
+        n_slots)`; 0 where that has none."""
+        at = self.state_at.expand(*states.shape[:-1], -1)
+        return torch.where(at < 0, 0, states.gather(-1, at.clamp(min=0)))
 
     def states(self, frames_nm: Tensor) -> Tensor:
         """Return the states of torsions `(..., n_residues, MOST_TORSIONS)` in frames `(..., n_atoms, 3)`."""
@@ -277,13 +297,12 @@ class ChainFeatures:
         return torch.cat(found).reshape(frames_nm.shape[:-2])
 
 
-def internal_coordinates(
-    x: Tensor, root: tuple[int, int, int], rows: Tensor, closing: Tensor, primary: Tensor
-) -> Tensor:
+def internal_coordinates(x: Tensor, layout: ChainLayout) -> Tensor:
     """Return lengths, angles and dihedrals `(..., 3 + 3 n_placed)` of frames `(..., n_atoms, 3)`; dihedrals that are
     counted from another one as the difference, all in (-π, π] or a full turn beside. Of rows `closing` a ring the other
     bond's length stands in the place of the angle."""
-    a, b, c = root
+    a, b, c = layout.root
+    rows, closing, primary = (table.to(x.device) for table in layout.tables)
     head = torch.stack(
         [(x[..., a, :] - x[..., b, :]).norm(dim=-1), (x[..., c, :] - x[..., b, :]).norm(dim=-1),
          _angle(x[..., a, :], x[..., b, :], x[..., c, :])], dim=-1,
@@ -329,23 +348,10 @@ def _unit(x: Tensor) -> Tensor:
     return x / (x.square().sum(-1, keepdim=True) + _TINY).sqrt()
 
 
-def _levels(layout: ChainLayout) -> list[list[int]]:
-    """Return rows of `placed` in groups that can be placed at once, one after the other."""
-    level_of = dict.fromkeys(layout.root, 0)
-    found: list[list[int]] = []
-    for k, (atom, *refs) in enumerate(layout.placed):
-        level_of[atom] = 1 + max(level_of[i] for i in refs)
-        while len(found) < level_of[atom]:
-            found.append([])
-        found[level_of[atom] - 1].append(k)
-    return found
-
-
 # Frames of peptides as the flow leaves them, mended by small turns. A flow draws some torsions a few degrees beyond the
-# end of the state that it should be in, rotors above all, and some atoms nearer to each other than they ever come in
-# MD. Drawing whole chunks again for that costs more than the chunks themselves, and favours tight ones. Torsions are
-# mirrored at the end of their state instead, and those of frames in which atoms overlap are turned downhill until none
-# do.
+# end of the state that it should be in, and some atoms nearer to each other than they ever come in MD. Drawing whole
+# chunks again for that is expensive and favours tight ones: torsions are mirrored at the end of their state instead,
+# and those of frames in which atoms overlap are turned downhill until none do.
 
 # A torsion is mirrored that is not further beyond the end of its state; it then stands at least so far inside.
 _MIRRORED_DEG, _INSIDE_DEG = 30.0, 0.05

@@ -32,12 +32,12 @@ _MOST_TRIED = 8
 
 
 def standard_peptide(scene: Scene) -> tuple[Scene, npt.NDArray[np.int64]]:
-    """Return the peptide as `build_peptide` makes it, at the positions of `scene`, and the order of its atoms.
+    """Return the peptide as `build_peptide` makes it, at the positions of `scene`, and its `order` (n_atoms,): atom k
+    is atom `order[k]` of `scene`.
 
-    Its atom k is atom `order[k]` of `scene`, `order` (n_atoms,). The sequence is read from the residues' names, those
-    of Amber, CHARMM and GROMACS included; atoms are matched by their bonds and handedness, so that their names and
-    order play no part. Raises InputError for a scene that is no single chain of the twenty amino acids between their
-    usual ends, or has another handedness than L.
+    The sequence is read from the residues' names, those of Amber, CHARMM and GROMACS included; atoms are matched by
+    their bonds and handedness. Raises InputError for a scene that is no single chain of the twenty L amino acids
+    between their usual ends.
     """
     names = [template.name if (template := template_for(name)) else name for name in scene.residue_names]
     hydrogens = sum(element == "H" for element in scene.elements)
@@ -82,12 +82,8 @@ _TETRAHEDRAL = {"C": 4, "N": 4, "O": 2, "S": 2}
 
 
 def chain_layout(scene: Scene) -> chains.ChainLayout:
-    """Return how the atoms of one peptide chain follow from internal coordinates.
-
-    Residues and atom names are those of `systems.prepare.peptide.build_peptide`; a chain with other names is matched to
-    one first. Torsions are those about bonds in no ring. Raises InputError for a scene that is no single chain of amino
-    acids with at least one peptide bond.
-    """
+    """Return how the atoms of one peptide chain, named as by `systems.prepare.peptide.build_peptide`, follow from
+    internal coordinates. Raises InputError for a scene that is no single chain with at least one peptide bond."""
     graph = bonded_graph(scene)
     if not len(backbone_torsions(scene)["omega"]) or not nx.is_connected(graph):
         raise InputError(f"{scene.name} is no single peptide chain, which residues as tokens need.")
@@ -108,7 +104,7 @@ class _Builder:
         self.primary: list[int] = []
         self.residue_of: list[int] = []
         self.keys: list[str] = []
-        self.kinds: list[int] = []
+        self.motions: list[int] = []
 
     def layout(self) -> chains.ChainLayout:
         a, b, c = root = self._root()
@@ -137,7 +133,7 @@ class _Builder:
                     self._place(atom, near, next_, last, None if near == b else first)
         return chains.ChainLayout(
             self.scene.n_atoms, root, tuple(self.placed), tuple(self.closing), tuple(self.primary),
-            tuple(self.residue_of), tuple(self.keys), tuple(self.kinds), tuple(self.scene.residue_names),
+            tuple(self.residue_of), tuple(self.keys), tuple(self.motions), tuple(self.scene.residue_names),
         )  # fmt: skip
 
     def _ring_neighbours(self, atom: int, among: set[int]) -> list[int]:
@@ -153,28 +149,28 @@ class _Builder:
         raise InputError(f"{self.scene.name} begins with {self.scene.residue_names[0]}, no cap and no amino acid.")
 
     def _names(self) -> list[str]:
-        """Return the atoms' names, those of hydrogens on one atom given anew by where they stand.
-
-        Which of two hydrogens is HB2 differs between molecules and programs, and no motion turns one into the other.
-        """
+        """Return the atoms' names, those of hydrogens on one atom given anew by where they stand: which of two is HB2
+        differs between programs, and no motion turns one into the other."""
         names, x = list(self.scene.atom_names), self.scene.positions_nm
         for near in range(self.scene.n_atoms):
             hydrogens = [i for i in self.graph[near] if self.scene.elements[i] == "H"]
             heavy = sorted((i for i in self.graph[near] if i not in hydrogens), key=lambda i: names[i])
             if len(hydrogens) < 2 or not heavy:
                 continue
-            known = sorted(hydrogens, key=lambda i: names[i])
+            ordered = sorted(hydrogens, key=lambda i: names[i])
             if len(hydrogens) == 2 and len(heavy) == 1:
                 # Flat, as amides are: the one on the side of what lies beyond, first by name, is the first.
                 beyond = min((i for i in self.graph[heavy[0]] if i != near), key=lambda i: names[i])
-                away = np.abs(torsion(x, [[i, near, heavy[0], beyond] for i in known]))
-                known = [known[k] for k in np.argsort(away, kind="stable")]
+                away = np.abs(torsion(x, [[i, near, heavy[0], beyond] for i in ordered]))
+                ordered = [ordered[k] for k in np.argsort(away, kind="stable")]
             else:
                 # Around the bond to one neighbour, from another one or from the first hydrogen.
-                start = heavy[1] if len(heavy) > 1 else known[0]
-                turned = torsion(x, [[start, heavy[0], near, i] for i in known]) % (2 * np.pi)
-                known = [known[k] for k in np.argsort(np.where(np.array(known) == start, 0.0, turned), kind="stable")]
-            for atom, name in zip(known, sorted(names[i] for i in hydrogens), strict=True):
+                start = heavy[1] if len(heavy) > 1 else ordered[0]
+                turned = torsion(x, [[start, heavy[0], near, i] for i in ordered]) % (2 * np.pi)
+                ordered = [
+                    ordered[k] for k in np.argsort(np.where(np.array(ordered) == start, 0.0, turned), kind="stable")
+                ]
+            for atom, name in zip(ordered, sorted(names[i] for i in hydrogens), strict=True):
                 names[atom] = name
         return names
 
@@ -227,7 +223,7 @@ class _Builder:
     def _add(self, owner: int, *coordinates: tuple[str, tuple[int, ...]], turning: bool = False) -> None:
         for what, atoms in coordinates:
             self.residue_of.append(owner)
-            self.kinds.append(chains.TURNING if turning and what == _DIHEDRAL else chains.STIFF)
+            self.motions.append(chains.TURNING if turning and what == _DIHEDRAL else chains.STIFF)
             names = [self._name(i, owner) for i in atoms]
             if what != _DIHEDRAL and names[0] > names[-1]:
                 names.reverse()
@@ -278,17 +274,14 @@ class PeptideConfig(ModelConfig):
         return torch.logspace(math.log10(self.shortest_ps), math.log10(self.longest_ps), n, dtype=torch.float64).float()
 
     def places(self, residues: tuple[str, ...]) -> Tensor:
-        """Return the numbers `(n_residues, 3)` of each residue's type, the one's before and the one's after.
-
-        Raises InputError for a type that training did not see.
-        """
-        known = {name: k for k, name in enumerate((*ENDS, *self.types))}
-        for name in residues:
-            if name not in known:
-                raise InputError(
-                    f"residue {name} is none that these weights were trained on ({', '.join(self.types)})."
-                )
-        row = [known[name] for name in (ENDS[0], *residues, ENDS[1])]
+        """Return the numbers `(n_residues, 3)` of each residue's type, the one's before and the one's after. Raises
+        InputError for a type that training did not see."""
+        numbers = {name: k for k, name in enumerate((*ENDS, *self.types))}
+        if unseen := [name for name in residues if name not in numbers]:
+            raise InputError(
+                f"residue {unseen[0]} is none that these weights were trained on ({', '.join(self.types)})."
+            )
+        row = [numbers[name] for name in (ENDS[0], *residues, ENDS[1])]
         return torch.tensor([row[1:-1], row[:-2], row[2:]]).T
 
 
@@ -323,56 +316,53 @@ def stated_torsions(scene: Scene, layout: chains.ChainLayout) -> chains.StatedTo
     end's ammonium."""
     graph = bonded_graph(scene)
     ring = {int(i) for i in ring_bonds(scene).flatten()}
-    rows: list[tuple[list[int], int, int, chains.Kind]] = []
+    rows: list[tuple[list[int], int, int, chains.StateBounds]] = []
     taken: dict[int, int] = {}
-    for atom, near, next_, last in layout.turning:
+    for quad in layout.turning:
+        atom, near, next_, _ = quad
         residue, names = int(scene.residue_of_atom[near]), tuple(scene.atom_names[i] for i in (atom, near, next_))
+        slot, bounds = chains.FIRST_OF_SIDE_CHAIN, chains.RING  # the pucker of a ring, on either side of its plane
         if names[1:] == ("CA", "N"):
-            if layout.types[residue] not in _FREE_PHI:
-                rows.append(([atom, near, next_, last], residue, 0, chains.PHI))
+            if layout.types[residue] in _FREE_PHI:
+                continue
+            slot, bounds = 0, chains.PHI
         elif names == ("N", "C", "CA"):
             before_proline = layout.types[residue + 1 : residue + 2] == ("PRO",)
-            rows.append(
-                ([atom, near, next_, last], residue, 1, chains.PSI_BEFORE_PROLINE if before_proline else chains.PSI)
-            )
-        elif not graph.has_edge(near, next_):
-            # The pucker of a ring, on either side of its plane.
-            rows.append(([atom, near, next_, last], residue, chains.FIRST_OF_SIDE_CHAIN, chains.RING))
-        elif names[1:] == ("N", "CA"):
-            if layout.types[residue] not in _LONGEST:
-                rows.append(([atom, near, next_, last], residue, chains.MOST_TORSIONS - 1, chains.THREEFOLD))
-        elif names[1] not in _BACKBONE:
+            slot, bounds = 1, chains.PSI_BEFORE_PROLINE if before_proline else chains.PSI
+        elif names[1:] == ("N", "CA") and graph.has_edge(near, next_):
+            if layout.types[residue] in _LONGEST:
+                continue
+            slot, bounds = chains.MOST_TORSIONS - 1, chains.THREEFOLD
+        elif graph.has_edge(near, next_):
             tetrahedral = all(graph.degree[i] == _TETRAHEDRAL.get(scene.elements[i]) for i in (near, next_))
             slot = taken.get(residue, chains.FIRST_OF_SIDE_CHAIN)
-            if (tetrahedral or (near in ring and atom in ring)) and slot < chains.MOST_TORSIONS:
-                taken[residue] = slot + 1
-                rows.append(
-                    ([atom, near, next_, last], residue, slot, chains.THREEFOLD if tetrahedral else chains.RING)
-                )
+            aromatic = near in ring and atom in ring
+            if names[1] in _BACKBONE or not (tetrahedral or aromatic) or slot >= chains.MOST_TORSIONS:
+                continue
+            taken[residue] = slot + 1
+            bounds = chains.THREEFOLD if tetrahedral else chains.RING
+        rows.append((list(quad), residue, slot, bounds))
     return chains.StatedTorsions.of(rows, len(layout.types))
 
 
 def chain_scale(
-    frames: Iterable[tuple[chains.ChainLayout, npt.NDArray[np.float32]]], known: chains.ChainScale | None = None
+    frames: Iterable[tuple[chains.ChainLayout, npt.NDArray[np.float32]]], start: chains.ChainScale | None = None
 ) -> chains.ChainScale:
     """Measure stiff coordinates over frames `(n, n_atoms, 3)` nm of several peptides, each frame as much as any other.
 
-    Lengths that vary by less than RIGID_NM are rigid: their deviation is 0. Residues of one type share slots. What is
-    `known` stays as it is; what it lacks is added.
+    Lengths that vary by less than RIGID_NM are rigid: their deviation is 0. Residues of one type share slots. What
+    `start` has stays as it is; what it lacks is added.
     """
+    start = start or chains.ChainScale({}, {}, {}, 0)
     found: dict[str, list[npt.NDArray[np.float64]]] = {}
     turning: dict[str, None] = {}
-    mean, deviation, slots = (
-        ({}, {}, {}) if known is None else (dict(known.mean), dict(known.deviation), dict(known.slots))
-    )
-    old = mean.keys() | slots.keys()
+    mean, deviation, slots = dict(start.mean), dict(start.deviation), dict(start.slots)
     for layout, x in frames:
-        rows, closing, primary = torch.tensor(layout.placed), torch.tensor(layout.closing), torch.tensor(layout.primary)
-        values = chains.internal_coordinates(torch.from_numpy(x).double(), layout.root, rows, closing, primary).numpy()
-        for k, (key, kind) in enumerate(zip(layout.keys, layout.kinds, strict=True)):
-            if key in old:
+        values = chains.internal_coordinates(torch.from_numpy(x).double(), layout).numpy()
+        for k, (key, motion) in enumerate(zip(layout.keys, layout.motions, strict=True)):
+            if key in start.mean or key in start.slots:
                 continue
-            if kind == chains.TURNING:
+            if motion == chains.TURNING:
                 turning[key] = None
             else:
                 found.setdefault(key, []).append(values[:, k])
@@ -394,14 +384,14 @@ def chain_scale(
     for key in sorted(order, key=lambda key: key.split()[0] in chains.FREE_ENDS):
         bearer, wanted = key.split()[0], 2 if key in turning else 1
         if bearer in chains.FREE_ENDS:
-            start = 1 + max((slot for some in taken.values() for slot in some), default=-1)
+            first = 1 + max((slot for some in taken.values() for slot in some), default=-1)
         else:
             full = taken.get(bearer, set()).union(*(taken.get(end, ()) for end in chains.FREE_ENDS))
-            start = next(k for k in itertools.count() if full.isdisjoint(range(k, k + wanted)))
-        slots[key] = start
-        taken.setdefault(bearer, set()).update(range(start, start + wanted))
+            first = next(k for k in itertools.count() if full.isdisjoint(range(k, k + wanted)))
+        slots[key] = first
+        taken.setdefault(bearer, set()).update(range(first, first + wanted))
     n_slots = 1 + max((slot for some in taken.values() for slot in some), default=-1)
-    return chains.ChainScale(mean, deviation, slots, n_slots if known is None else max(n_slots, known.n_slots))
+    return chains.ChainScale(mean, deviation, slots, max(n_slots, start.n_slots))
 
 
 def _backbone_first(key: str) -> tuple[int, str]:
@@ -412,11 +402,8 @@ def _backbone_first(key: str) -> tuple[int, str]:
 
 def unknown_coordinates(layout: chains.ChainLayout, scale: chains.ChainScale) -> list[str]:
     """Return the coordinates of a layout that no data show."""
-    return [
-        key
-        for key, kind in zip(layout.keys, layout.kinds, strict=True)
-        if (key not in scale.slots if kind == chains.TURNING else key not in scale.mean)
-    ]
+    pairs = zip(layout.keys, layout.motions, strict=True)
+    return [key for key, motion in pairs if key not in (scale.slots if motion == chains.TURNING else scale.mean)]
 
 
 def resolved(layout: chains.ChainLayout, scale: chains.ChainScale) -> chains.ChainLayout:
@@ -426,8 +413,8 @@ def resolved(layout: chains.ChainLayout, scale: chains.ChainScale) -> chains.Cha
             f"{len(unknown)} internal coordinates occur in no training molecule, the first is {unknown[0]!r}; train on "
             "a peptide that has this residue at such a place."
         )
-    kinds = tuple(
-        chains.RIGID if kind == chains.STIFF and scale.deviation[key] == 0.0 else kind
-        for key, kind in zip(layout.keys, layout.kinds, strict=True)
+    motions = tuple(
+        chains.RIGID if motion == chains.STIFF and scale.deviation[key] == 0.0 else motion
+        for key, motion in zip(layout.keys, layout.motions, strict=True)
     )
-    return replace(layout, kinds=kinds)
+    return replace(layout, motions=motions)

@@ -11,7 +11,6 @@ overlap, are mended by small turns; chunks with frames where that is not enough 
 
 from __future__ import annotations
 
-import copy
 import math
 from typing import ClassVar, NamedTuple, cast
 
@@ -21,13 +20,7 @@ from torch.nn import functional as F
 
 from surrogate.models.lam_slide import flow
 from surrogate.models.layers import ParallelBlock, TimeEmbedding, rotary_angles
-from surrogate.models.peptides.chains import (
-    MOST_STATES,
-    MOST_TORSIONS,
-    ChainFeatures,
-    conditioning_states,
-    mended,
-)
+from surrogate.models.peptides.chains import MOST_STATES, MOST_TORSIONS, ChainFeatures, conditioning_states, mended
 from surrogate.models.peptides.layout import ENDS, PeptideConfig, chain_features
 from surrogate.models.propagator import Chunk, Molecule, Propagator
 from systems.chemistry.geometry import superpose
@@ -35,9 +28,7 @@ from systems.errors import InputError
 from systems.scene import Scene
 
 # Which state each torsion with barriers is in, drawn before the flow draws the frames that go with it: a flow that
-# draws barrier crossings along with everything else leaks between states, since between two modes of noise there is
-# always some density, and a categorical draw does not. The flow is conditioned on the outcome, and frames that disobey
-# are drawn again.
+# draws barrier crossings along with everything else leaks between states, and a categorical draw does not.
 
 _WIDTH = 96
 _WAVES = 8
@@ -50,10 +41,9 @@ _FAST = 10.0
 class StateJumps(nn.Module):
     """The probabilities that torsions change their states between a frame and the next.
 
-    They follow from the residue's type, its numbers in the given frame, its states and its two neighbours' in that and
-    in the frame before, its own in the one before that, the new states of its torsions before this one (side chains
-    turn two torsions at once), and both times. Of neighbours' types only levels are learned, which add up: else the
-    network would know each pair of training by itself.
+    They follow from the residue's type, its numbers in the given frame, its and its two neighbours' states in that and
+    in the frame before, its own in the one before that, the new states of its torsions before this one, and both times.
+    Of neighbours' types only levels are learned, which add up: else the network would know each pair of training.
     """
 
     def __init__(self, n_slots: int, n_types: int) -> None:
@@ -77,11 +67,11 @@ class StateJumps(nn.Module):
         nn.init.zeros_(self.logits.weight)
         nn.init.constant_(self.logits.bias, _RARELY)
 
-    def of_known(self, known: Tensor, states: Tensor, places: Tensor, counts: Tensor) -> Tensor:
-        """What all frames of a chunk have in common: `known` (b, r, slots), its `states` (b, r, MOST_TORSIONS),
+    def of_observed(self, observed: Tensor, states: Tensor, places: Tensor, counts: Tensor) -> Tensor:
+        """What all frames of a chunk have in common: `observed` (b, r, slots), its `states` (b, r, MOST_TORSIONS),
         `places` (r, 3) -> (b, r, width)."""
         beside = _beside(conditioning_states(states, counts))
-        h: Tensor = sum((of(x) for of, x in zip(self.of_given, beside, strict=True)), self.of_numbers(known.float()))
+        h: Tensor = sum((of(x) for of, x in zip(self.of_given, beside, strict=True)), self.of_numbers(observed.float()))
         return h + self.of_type(places[:, 0])
 
     def of_times_alone(
@@ -108,7 +98,7 @@ class StateJumps(nn.Module):
     def probabilities(self, torsion: int, h: Tensor, levels: Tensor, now: Tensor, conditioning: Tensor) -> Tensor:
         """Return the logits `(b, t, r, MOST_STATES)` of the new state of one torsion of each residue.
 
-        `h` (b, t, r, width) is what `of_known`, `of_times_alone` and `of_frames` add up to, `levels` what
+        `h` (b, t, r, width) is what `of_observed`, `of_times_alone` and `of_frames` add up to, `levels` what
         `of_times_alone` returns; `now` (b, t, r) the torsion's state in the frame before, `conditioning` (b, t, r, n)
         the `conditioning_states` of the new frame, of which torsions before this one count.
         """
@@ -128,22 +118,22 @@ class StateJumps(nn.Module):
         self.beside_change[1, :, 0, 0, 1] += after / _FAST
 
     def loss(
-        self, known: Tensor, states: Tensor, places: Tensor, counts: Tensor, times_ps: Tensor, apart_ps: Tensor,
+        self, observed: Tensor, states: Tensor, places: Tensor, counts: Tensor, times_ps: Tensor, apart_ps: Tensor,
         share: Tensor | None = None,
     ) -> Tensor:  # fmt: skip
         """Return the negative log-likelihood of what torsions did, per frame and torsion.
 
-        `known` (b, r, slots); `states` (b, 1 + t, r, MOST_TORSIONS), the given frame's first; `share` (b, r,
+        `observed` (b, r, slots); `states` (b, 1 + t, r, MOST_TORSIONS), the given frame's first; `share` (b, r,
         MOST_TORSIONS): what each torsion's change counts in a window, 1 where it is not given.
         """
-        with torch.autocast(known.device.type, enabled=False):
+        with torch.autocast(observed.device.type, enabled=False):
             before, new = states[:, :-1], states[:, 1:]
             earlier = torch.cat([before[:, :1], before[:, :-1]], dim=1)
             of_times, levels = self.of_times_alone(times_ps, apart_ps, places, counts)
             h = self.of_frames(conditioning_states(before, counts), conditioning_states(earlier, counts))
-            h = h + of_times[:, :, None] + self.of_known(known, states[:, 0], places, counts)[:, None]
+            h = h + of_times[:, :, None] + self.of_observed(observed, states[:, 0], places, counts)[:, None]
             conditioning = conditioning_states(new, counts)
-            total = known.new_zeros(())
+            total = observed.new_zeros(())
             for torsion in torch.nonzero((counts > 0).any(0))[:, 0].tolist():
                 has = counts[:, torsion] > 0
                 logits = self.probabilities(torsion, h, levels, before[..., torsion], conditioning)[:, :, has]
@@ -153,17 +143,17 @@ class StateJumps(nn.Module):
             return total / (times_ps.numel() * max(1, int((counts > 0).sum())))
 
     def draw(
-        self, known: Tensor, states: Tensor, places: Tensor, counts: Tensor, times_ps: Tensor, apart_ps: Tensor,
+        self, observed: Tensor, states: Tensor, places: Tensor, counts: Tensor, times_ps: Tensor, apart_ps: Tensor,
         uniform: Tensor,
     ) -> Tensor:  # fmt: skip
         """Return states `(b, t, r, MOST_TORSIONS)` of new frames, from the given frame's numbers and `states`
         (b, r, MOST_TORSIONS) and numbers `uniform` (b, t, r, MOST_TORSIONS) in [0, 1)."""
-        with torch.autocast(known.device.type, enabled=False):
+        with torch.autocast(observed.device.type, enabled=False):
             of_times, levels = self.of_times_alone(times_ps, apart_ps, places, counts)
-            common = self.of_known(known, states, places, counts)[:, None] + of_times[:, :, None]
+            common = self.of_observed(observed, states, places, counts)[:, None] + of_times[:, :, None]
             # A residue's torsion in each state, as `conditioning_states` has it.
-            ones = torch.eye(MOST_STATES, device=known.device) * (counts > 0)[..., None, None]
-            residues, most = torch.arange(len(counts), device=known.device), (counts - 1).clamp(min=0)
+            ones = torch.eye(MOST_STATES, device=observed.device) * (counts > 0)[..., None, None]
+            residues, most = torch.arange(len(counts), device=observed.device), (counts - 1).clamp(min=0)
             torsions = torch.nonzero((counts > 0).any(0))[:, 0].tolist()
             now, found = states[:, None], []
             before = conditioning = conditioning_states(now, counts)
@@ -213,7 +203,6 @@ def generators(noise: Tensor, place: int, attempt: int = 0) -> list[torch.Genera
 
 # Residues further apart along the chain are alike far.
 _FAR = 6
-_SOLVERS = ("gaussian", "angular", *flow.solvers_for("linear"))
 _MOST_CORRELATED = 0.995
 _LONGEST_WAVE = 4.0
 # Chunks that disobey the states that were drawn for them, or whose atoms overlap, are drawn again so often.
@@ -294,27 +283,23 @@ class PeptideFlow(nn.Module):
 
     def forward(self, o: Tensor, tau: Tensor, conditioning: Conditioning) -> Tensor:
         """`o` (b, t, r, slots), `tau` (b,), or (1,) of all -> like `o`."""
-        skip, out, scale_in = (flow.expand(v, o) for v in flow.preconditioning(tau, "linear"))
+        skip, out, scale_in = (flow.expand(v, o) for v in flow.preconditioning(tau))
         return skip * o + out * self._network(o * scale_in, tau, conditioning)
 
-    def conditioning(self, known: Tensor, times_ps: Tensor, places: Tensor, states: Tensor) -> Conditioning:
-        """Return what all evaluations of a chunk have in common, of the given frame `known` (b, r, slots), `times_ps`
-        (b, t), `places` (r, 3), and `states` (b, 1 + t, r, n) of the given frame and the others
-        (`conditioning_states`)."""
+    def conditioning(self, observed: Tensor, times_ps: Tensor, places: Tensor, states: Tensor) -> Conditioning:
+        """Return what all evaluations of a chunk have in common, of the given frame's numbers `observed` (b, r, slots),
+        `times_ps` (b, t), `places` (r, 3), and the `conditioning_states` (b, 1 + t, r, n) of that frame and the
+        others."""
         types = places[:, 0]
         of_states = self.of_states(states, types)
         of_type: Tensor = sum((table(places[:, k]) for k, table in enumerate(self.of_type)), torch.zeros(()))
-        angles = rotary_angles(times_ps.shape[1] + 1, self.config.width // self.config.n_heads).to(known.device)
-        place = torch.arange(len(types), device=known.device)
+        angles = rotary_angles(times_ps.shape[1] + 1, self.config.width // self.config.n_heads).to(observed.device)
+        place = torch.arange(len(types), device=observed.device)
         apart = (place[:, None] - place).clamp(-_FAR, _FAR) + _FAR
-        return Conditioning(
-            types,
-            of_type,
-            self.of_known(known[:, None], types) + of_states[:, :1] + self.of_given,
-            self._of_times(times_ps)[:, :, None] + of_states[:, 1:],
-            (angles.cos(), angles.sin()),
-            [cast(PeptideLayer, layer).of_distance(apart).permute(2, 0, 1) for layer in self.layers],
-        )
+        given = self.of_known(observed[:, None], types) + of_states[:, :1] + self.of_given
+        of_frames = self._of_times(times_ps)[:, :, None] + of_states[:, 1:]
+        biases = [cast(PeptideLayer, layer).of_distance(apart).permute(2, 0, 1) for layer in self.layers]
+        return Conditioning(types, of_type, given, of_frames, (angles.cos(), angles.sin()), biases)
 
     def _network(self, o: Tensor, tau: Tensor, conditioning: Conditioning) -> Tensor:
         noisy = self.of_noisy(o, conditioning.types) + conditioning.of_frames
@@ -352,13 +337,14 @@ class PeptideSlide(Propagator):
         if config.scale is None or not config.types:
             raise InputError("a model of peptides needs the scale of their coordinates and their residue types.")
         self.config = config
-        if config.usual_solver not in _SOLVERS:
-            raise InputError(f"usual_solver = {config.usual_solver!r} is none of {', '.join(_SOLVERS)}.")
-        self.solvers = tuple(dict.fromkeys((config.usual_solver, *_SOLVERS)))
+        if config.usual_solver not in flow.SOLVERS:
+            raise InputError(f"usual_solver = {config.usual_solver!r} is none of {', '.join(flow.SOLVERS)}.")
+        self.solvers = tuple(dict.fromkeys((config.usual_solver, *flow.SOLVERS)))
         self.usual_steps = config.usual_steps
         n_types, n_slots = len(config.types) + len(ENDS), config.scale.n_slots
         self.flow = PeptideFlow(config, n_slots)
         self.jumps = StateJumps(n_slots, n_types)
+        self.lag_range_ps = config.shortest_ps, config.longest_ps
         self.lag_ps = config.shortest_ps
         self.token_mean = nn.Buffer(torch.zeros(n_types, MOST_STATES, n_slots))
         self.token_scale = nn.Buffer(torch.ones(n_types, n_slots))
@@ -374,15 +360,6 @@ class PeptideSlide(Propagator):
         assert self.lag_ps is not None
         return max(1, min(self.config.chunk_frames, int(self.config.longest_ps / self.lag_ps * (1 + 1e-6))))
 
-    def at_lag(self, lag_ps: float) -> PeptideSlide:
-        """Return this model, its weights shared, with frames `lag_ps` apart. Raises InputError outside its range."""
-        c = self.config
-        if not c.shortest_ps * (1 - 1e-6) <= lag_ps <= c.longest_ps * (1 + 1e-6):
-            raise InputError(f"a lag of {lag_ps:g} ps is none that this model was trained for.")
-        model = copy.copy(self)
-        model.lag_ps = lag_ps
-        return model
-
     def normalised(self, frames_nm: Tensor, chain: ChainFeatures) -> tuple[Tensor, Tensor]:
         """Frames `(..., n_atoms, 3)` nm -> numbers `(..., n_residues, n_slots)`, zero in empty places, and the states
         `(..., n_residues, MOST_TORSIONS)` of torsions."""
@@ -393,8 +370,7 @@ class PeptideSlide(Propagator):
     def middle(self, states: Tensor, chain: ChainFeatures) -> Tensor:
         """Return from where numbers count, `(..., n_residues, n_slots)`, in `states` (..., n_residues,
         MOST_TORSIONS)."""
-        at = chain.state_at.expand(*states.shape[:-1], -1)
-        own = torch.where(at < 0, 0, states.gather(-1, at.clamp(min=0)))
+        own = chain.state_of_numbers(states)
         mean = self.token_mean[chain.places[:, 0]]
         found = mean[:, 0].expand_as(own)
         for state in range(1, MOST_STATES):
@@ -427,15 +403,15 @@ class PeptideSlide(Propagator):
         found = (table[right - 1] * (1 - share) + table[right] * share).clamp(0.0, _MOST_CORRELATED)
         return torch.where((times_ps >= self.config.forgotten_ps)[..., None, None], 0.0, found)
 
-    def innovations(self, later: Tensor, known: Tensor, times_ps: Tensor, types: Tensor) -> Tensor:
-        """Numbers `(b, t, r, slots)` at `times_ps` (b, t) after `known` (b, r, slots) -> innovations."""
+    def innovations(self, later: Tensor, observed: Tensor, times_ps: Tensor, types: Tensor) -> Tensor:
+        """Numbers `(b, t, r, slots)` at `times_ps` (b, t) after `observed` (b, r, slots) -> innovations."""
         rho = self.correlation_at(times_ps, types)
-        return (later - rho * known[:, None]) / (1.0 - rho.square()).sqrt()
+        return (later - rho * observed[:, None]) / (1.0 - rho.square()).sqrt()
 
-    def from_innovations(self, y: Tensor, known: Tensor, times_ps: Tensor, types: Tensor) -> Tensor:
+    def from_innovations(self, y: Tensor, observed: Tensor, times_ps: Tensor, types: Tensor) -> Tensor:
         """The inverse of `innovations`."""
         rho = self.correlation_at(times_ps, types)
-        return rho * known[:, None] + (1.0 - rho.square()).sqrt() * y
+        return rho * observed[:, None] + (1.0 - rho.square()).sqrt() * y
 
     def noise_shape(self, n_atoms: int) -> tuple[int, ...]:
         # At least as many numbers as a frame has coordinates that vary.
@@ -443,41 +419,40 @@ class PeptideSlide(Propagator):
 
     def next_chunk(self, last_frames_nm: Tensor, molecule: Molecule, noise: Tensor, *, solver_steps: int = 10,
                    solver: str | None = None, last_velocities_nm_ps: Tensor | None = None) -> Chunk:  # fmt: skip
-        """See `Propagator.next_chunk`."""
         chain: ChainFeatures | None = molecule.own
         if chain is None:
             raise InputError("this model knows peptides by residues; make molecules by its `featurise`.")
         types, filled = chain.places[:, 0], chain.code.filled
-        known, now = self.normalised(last_frames_nm[:, -1], chain)
+        observed, now = self.normalised(last_frames_nm[:, -1], chain)
         assert self.lag_ps is not None
-        ahead = self.lag_ps * torch.arange(1, self.n_new + 1, device=known.device)
-        times = ahead.expand(len(known), -1).float()
-        drawn = known.new_zeros(*noise.shape[:2], *filled.shape)
-        drawn[..., filled] = noise.flatten(2)[..., : int(filled.sum())].to(known)
+        ahead = self.lag_ps * torch.arange(1, self.n_new + 1, device=observed.device)
+        times = ahead.expand(len(observed), -1).float()
+        drawn = observed.new_zeros(*noise.shape[:2], *filled.shape)
+        drawn[..., filled] = noise.flatten(2)[..., : int(filled.sum())].to(observed)
         counts, apart = chain.stated.counts, times_apart(times, self.config.forgotten_ps)
         shape = (self.n_new, *counts.shape)
 
         def draw_states(rows: Tensor, attempt: int) -> Tensor:
             seeds = generators(noise[rows], STATES, attempt)
-            uniform = torch.stack([torch.rand(shape, generator=g) for g in seeds]).to(known)
-            return self.jumps.draw(known[rows], now[rows], chain.places, counts, times[rows], apart[rows], uniform)
+            uniform = torch.stack([torch.rand(shape, generator=g) for g in seeds]).to(observed)
+            return self.jumps.draw(observed[rows], now[rows], chain.places, counts, times[rows], apart[rows], uniform)
 
-        rows = torch.arange(len(known), device=known.device)
+        rows = torch.arange(len(observed), device=observed.device)
         states = draw_states(rows, 0)
         evaluations = 0.0
 
         def solve(rows: Tensor, drawn: Tensor) -> tuple[Tensor, Tensor, Tensor]:
             """Return frames, and in which rows some disobey their states and some overlap, all that could be done."""
             of_states = conditioning_states(torch.cat([now[rows, None], states[rows]], dim=1), counts)
-            conditioning = self.flow.conditioning(known[rows], times[rows], chain.places, of_states)
+            conditioning = self.flow.conditioning(observed[rows], times[rows], chain.places, of_states)
 
             def predict(o: Tensor, tau: Tensor) -> Tensor:
                 nonlocal evaluations
-                evaluations += len(rows) / len(known)
+                evaluations += len(rows) / len(observed)
                 return torch.where(filled, self.flow(o, tau, conditioning), 0.0)
 
-            y = flow.SOLVERS[solver or self.solvers[0]](predict, drawn, solver_steps, "linear")
-            tokens = self._tokens(self.from_innovations(y, known[rows], times[rows], types), states[rows], chain)
+            y = flow.SOLVERS[solver or self.solvers[0]](predict, drawn, solver_steps)
+            tokens = self._tokens(self.from_innovations(y, observed[rows], times[rows], types), states[rows], chain)
             resolved = mended(tokens.flatten(0, 1), states[rows].flatten(0, 1), chain)
             frames, astray, crowded = (x.unflatten(0, tokens.shape[:2]) for x in resolved)
             return self._laid(frames, chain), astray.any(-1), crowded.any(-1)

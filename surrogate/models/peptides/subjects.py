@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import cast
@@ -19,12 +19,11 @@ from surrogate.models.peptides.layout import PeptideConfig
 from surrogate.models.peptides.model import PeptideSlide
 from systems.errors import InputError
 
-# Weights that turn frames of short runs from chosen starts into equilibrium, by a reversible Markov model.
-# Runs seeded in rare states show these states too often. Forward windows need no weights, whatever they start from: a
-# propagator is conditional. A window read backwards does: it starts where a run ended up, so that exits from a rare
-# state become entries, and there would be as many of these as seeds. Weighted by how likely equilibrium is to be where
-# the run came from, there are as many as detailed balance asks for (Wu et al., Proc. Natl. Acad. Sci. 113, E3221
-# (2016)).
+# Weights that turn frames of short runs from chosen starts into equilibrium, by a reversible Markov model. Forward
+# windows need none, whatever they start from: a propagator is conditional. A window read backwards does: it starts
+# where a run ended up, so that exits from a rare state become entries, as many as there are seeds. Weighted by how
+# likely equilibrium is to be where the run came from, there are as many as detailed balance asks for (Wu et al., Proc.
+# Natl. Acad. Sci. 113, E3221 (2016)).
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
@@ -47,16 +46,14 @@ def equilibrium_weights(
 ) -> FloatArray | None:
     """Return a weight for each frame, of mean 1, in the order of the runs. None for runs too short for the lag.
 
-    `runs`: features `(n, k)` that tell slow states apart (cosines and sines of torsions), one array for each run.
+    `runs`: features `(n, k)` that separate slow states (cosines and sines of torsions), one array for each run.
+    Populations from elsewhere (metadynamics) are given by `states` (n_frames,), the state of each frame, and `shares`
+    (n_states,), which need no norm: between states these weigh frames, within each the Markov model does.
 
     Where hardly any run goes between two states, a Markov model would put all weight into one that by chance was
     entered and not left. So each run is taken to begin and to end with a jump between any two frames, late frames
-    (relaxed ones) more likely. Populations that are known otherwise (from metadynamics) are given by `states`
-    (n_frames,), the state of each frame, and `shares` (n_states,), which need no norm: within each state the Markov
-    model weighs frames, between them the shares do.
-
-    TICA, k-means and the reversible maximum-likelihood model of transition counts (Trendelkamp-Schroer et al., J. Chem.
-    Phys. 143, 174101 (2015)) are deeptime's.
+    (relaxed ones) more likely. TICA, k-means and the reversible maximum-likelihood model (Trendelkamp-Schroer et al.,
+    J. Chem. Phys. 143, 174101 (2015)) are deeptime's.
     """
     cells = _cells(runs, lag_frames)
     if cells is None:
@@ -130,18 +127,15 @@ _TRIES = 20
 
 @dataclass(eq=False)
 class PeptideSubject:
-    """One sequence's frames, its input features, and the stretches that windows may be taken from.
-
-    `weights` (n_frames,): of frames in equilibrium, of mean 1 where they are kept, zero in what is held out. Without
-    them no window is read backwards.
-    """
+    """One sequence's frames and input features. `weights` (n_frames,): of frames in equilibrium, of mean 1 where they
+    are kept, zero in what is held out. Without them no window is read backwards."""
 
     frames: TrainingFrames
     chain: ChainFeatures
     weights: FloatArray | None = None
 
     def in_equilibrium(self, positive_phi_kt: Mapping[str, float]) -> PeptideSubject:
-        """Return this subject with weights, or itself where its runs do not tell how likely its states are."""
+        """Return this subject with weights, or itself where its runs do not show how likely its states are."""
         ranges = self.frames.split.ranges(self.frames.starts, validation=False)
         kept = np.concatenate([np.arange(low, high) for low, high in ranges])
         states, shares = self._signs_of_phi(kept, positive_phi_kt)
@@ -156,16 +150,12 @@ class PeptideSubject:
         return replace(self, weights=weights)
 
     def _signs_of_phi(self, kept: IntArray, positive_phi_kt: Mapping[str, float]) -> tuple[IntArray, FloatArray]:
-        """Return the pattern of phi's signs of each frame `kept` (n,), as a number, and the population of each pattern.
-
-        Residues are taken to be independent; those whose free energy is not given play no part, nor do those before a
-        proline, whose ring leaves them no room at phi > 0: how likely they are there is left to their own runs.
-        """
-        types = (*self.chain.code.layout.types, "")
+        """Return the pattern of phi's signs of each frame `kept` (n,), as a number, and the population of each pattern:
+        residues are taken to be independent, and those whose free energy is not given play no part."""
         states, shares = np.zeros(len(kept), dtype=np.int64), np.ones(1)
-        for residue in self.chain.signed.tolist():
+        for residue in self.chain.signed:
             name = self.frames.scene.residue_names[residue]
-            if name in positive_phi_kt and types[residue + 1] != "PRO":
+            if name in positive_phi_kt:
                 states = states + len(shares) * self._states[kept, residue, 0]
                 probabilities = float(np.exp(-positive_phi_kt[name]))
                 shares = np.concatenate([shares, shares * probabilities])
@@ -174,36 +164,33 @@ class PeptideSubject:
     @cached_property
     def _states(self) -> npt.NDArray[np.int8]:
         """The states of torsions in each frame: `(n_frames, n_residues, MOST_TORSIONS)`."""
-        blocks = (
-            self._frames(k, min(k + _BLOCK, self.frames.n_frames)) for k in range(0, self.frames.n_frames, _BLOCK)
-        )
+        blocks = self._blocks(0, self.frames.n_frames)
         return torch.cat([self.chain.states(block).to(torch.int8).cpu() for block in blocks]).numpy()
 
-    def _frames(self, low: int, high: int) -> Tensor:
-        return torch.from_numpy(self.frames.positions_nm(np.arange(low, high))).to(self.chain.places.device)
+    def _blocks(self, low: int, high: int) -> Iterator[Tensor]:
+        for start in range(low, high, _BLOCK):
+            idx = np.arange(start, min(start + _BLOCK, high))
+            yield torch.from_numpy(self.frames.positions_nm(idx)).to(self.chain.places.device)
 
     def _torsions(self, low: int, high: int) -> FloatArray:
         """Return cosines and sines `(n, 2 n_torsions)` of frames."""
         at = self.chain.code.turning_at
-        found = []
-        for start in range(low, high, _BLOCK):
-            tokens = self.chain.code.encode(self._frames(start, min(start + _BLOCK, high)))
-            found.append(tokens.flatten(-2)[:, torch.cat([at, at + 1])].cpu())
+        both = torch.cat([at, at + 1])
+        found = [self.chain.code.encode(block).flatten(-2)[:, both].cpu() for block in self._blocks(low, high)]
         return torch.cat(found).double().numpy()
 
     def windows(
         self, n: int, config: PeptideConfig, generator: torch.Generator, *, later: int | None = None,
         validation: bool = False,
     ) -> tuple[Tensor, Tensor]:  # fmt: skip
-        """Draw windows: frames `(n, 1 + later)` and the times `(n, later)` ps after the first; `later` is
-        `chunk_frames` where it is not given.
+        """Draw windows: frames `(n, 1 + later)` of one stretch and the times `(n, later)` ps after the first; `later`
+        is `chunk_frames` where it is not given.
 
-        Times are evenly spaced at a lag drawn evenly in its logarithm, or drawn one by one in the same way; none is
-        longer than the configuration's, and all frames of a window are of one stretch. With weights half of them are
-        read backwards, and in some the later frames are any of equilibrium, `forgotten_ps` after the first: windows
-        start from states that runs hold more often than equilibrium does as they are read forwards, from others
-        backwards. (From a common state runs hardly enter rare ones; averaged with windows that do, they would halve the
-        rate.)
+        Times are evenly spaced at a lag drawn evenly in its logarithm, or drawn one by one in the same way. With
+        weights half of the windows are read backwards, and in some the later frames are any of equilibrium,
+        `forgotten_ps` after the first. Windows start from states that runs hold more often than equilibrium does as
+        they are read forwards, from others backwards: from a common state runs hardly enter rare ones, and averaged
+        with windows that do they would halve the rate.
         """
         lag = self.frames.lag_ps
         ranges = np.array(self.frames.split.ranges(self.frames.starts, validation=validation))
@@ -266,15 +253,10 @@ class PeptideSubject:
         return torch.from_numpy(first), torch.from_numpy(found)
 
     @cached_property
-    def _likely_from(
-        self,
-    ) -> tuple[FloatArray, list[IntArray], list[IntArray]]:
-        """Return the sums of weights of groups of frames alike, each group's frames, and how many follow each in its
-        run, the most first.
-
-        Rare states lie early in runs that start there, so frames with long runs behind them are no fair sample of all;
-        within a group of one weight, which is one cell of the Markov model, they are.
-        """
+    def _likely_from(self) -> tuple[FloatArray, list[IntArray], list[IntArray]]:
+        """Return the sums of weights of groups of frames of one weight, each group's frames, and how many follow each
+        in its run, the most first. Only within a group (a cell of the Markov model) are frames with long runs behind
+        them a fair sample: rare states lie early in runs that start there."""
         assert self.weights is not None
         room = np.zeros(len(self.weights), dtype=np.int64)
         for low, high in self.frames.split.ranges(self.frames.starts, validation=False):
@@ -295,11 +277,8 @@ class PeptideSubject:
         return np.cumsum(cast(FloatArray, self.weights))
 
     def batch(self, n: int, config: PeptideConfig, generator: torch.Generator) -> tuple[Tensor, Tensor]:
-        """Draw windows as a flow sees them: half of the batches of whole chunks, the others of fewer frames.
-
-        Returns frames and times as `windows` does. Some windows hold a change of a torsion's state: a flow that is told
-        of it may see as many as it needs.
-        """
+        """Draw windows as `windows` does: half of the batches of whole chunks, the others of fewer frames. Some hold a
+        change of a torsion's state: a flow conditioned on it may see as many as it needs."""
         later = config.chunk_frames
         if float(torch.rand(1, generator=generator)) >= _WHOLE_SHARE:
             later = int(torch.randint(1, later + 1, (1,), generator=generator))
@@ -309,13 +288,10 @@ class PeptideSubject:
     def _with_crossings(
         self, idx: Tensor, times: Tensor, config: PeptideConfig, generator: torch.Generator
     ) -> tuple[Tensor, Tensor]:
-        """Put windows over crossings in the place of some, their spacing kept; half are read backwards if any are.
-
-        Read forwards, crossings need no weights. Backwards, the frame that the run came from must be as likely as
-        equilibrium has it among those on its own side.
-        """
-        kinds, relative = self._crossings
-        if not kinds:
+        """Put windows over crossings in the place of some, their spacing kept; half are read backwards if any are: then
+        the frame that the run came from must be as likely as equilibrium has it among those on its own side."""
+        crossings, relative = self._crossings
+        if not crossings:
             return idx, times
         asked = (torch.rand(len(idx), generator=generator) < _CROSSING_SHARE) & (times[:, 0] < config.forgotten_ps)
         backwards = torch.rand(len(idx), generator=generator) < (0.0 if self.weights is None else 0.5)
@@ -324,8 +300,8 @@ class PeptideSubject:
             ahead = (times[row] / self.frames.lag_ps).round().long()
             span = int(ahead[-1])
             draws = torch.rand(3, _TRIES, generator=generator, dtype=torch.float64).numpy()
-            crossings = kinds[row % len(kinds)]
-            first = crossings[(draws[0] * len(crossings)).astype(np.int64)] - (draws[1] * span).astype(np.int64)
+            some = crossings[row % len(crossings)]
+            first = some[(draws[0] * len(some)).astype(np.int64)] - (draws[1] * span).astype(np.int64)
             which = np.searchsorted(ranges[:, 0], first, side="right") - 1
             low, high = ranges[which.clip(min=0)].T
             fits = (first >= low) & (first + span < high) & (which >= 0)
@@ -343,10 +319,10 @@ class PeptideSubject:
         there are any; and how likely each frame `(n_frames,)` is to be kept so that those of one pattern of phi are as
         in equilibrium, the likeliest (but for a few) always."""
         ranges = self.frames.split.ranges(self.frames.starts, validation=False)
-        kinds = []
+        crossings = []
         for which in self._rare_torsions():
             moved = (np.diff(self._states[:, which[0], which[1]], axis=0) != 0).any(axis=1)
-            kinds.append(np.concatenate([low + np.flatnonzero(moved[low : high - 1]) for low, high in ranges]))
+            crossings.append(np.concatenate([low + np.flatnonzero(moved[low : high - 1]) for low, high in ranges]))
         pattern = (self._states[:, :, 0] << np.arange(self._states.shape[1])).sum(axis=1)
         relative = np.ones(len(pattern))
         if self.weights is not None:
@@ -355,7 +331,7 @@ class PeptideSubject:
                 kept = self.weights[inside & (self.weights > 0)]
                 if len(kept):
                     relative[inside] = self.weights[inside] / np.quantile(kept, _LIKELIEST)
-        return [some for some in kinds if len(some)], relative
+        return [some for some in crossings if len(some)], relative
 
     def _rare_torsions(self) -> list[tuple[IntArray, IntArray]]:
         """Return residues and slots of phi, and those of heavy side chains: psi and rotors turn often enough."""
@@ -386,9 +362,8 @@ def _distinct(ahead: Tensor, longest: int) -> Tensor:
 
 
 # Windows from which the probabilities of changes of states are learned: what is rare is drawn more often than it
-# occurs. Rare starts may be, since probabilities are conditional on the state that a torsion starts from; rare changes,
-# and windows chosen for another torsion's sake, if each then counts less in the loss, in proportion: the loss stays
-# what it was, but no longer rests on the few batches that happen to hold such a change.
+# occurs. Rare starts may be, since probabilities are conditional on them; rare changes, and windows chosen for another
+# torsion's sake, if each then counts less in the loss, in proportion.
 
 _POOL = 16_384
 # Changes are to be in this share of the windows that could hold them; nothing is drawn more than so much too often.

@@ -34,11 +34,10 @@ from surrogate.models.weights import Weights, load_weights, provenance_of, read_
 from surrogate.training.loop import ProgressFn, Stage, StageConfig, train_stages
 from systems.errors import InputError
 
-# The probabilities of entering phi > 0, set to those of leaving it and to how likely it is. Runs from chosen starts
-# show hundreds of exits from phi > 0 and hardly an entry, and a rate that is three times too high shows in no loss.
-# What is known well are the probabilities of leaving and the free energy of phi > 0 (umbrella sampling), and in
-# equilibrium as many frames enter as leave. So after training the probabilities of entering are moved, by a level of
-# each residue's type and of its neighbours', to where this holds in the mean over the frames of all training peptides.
+# Runs from chosen starts show hundreds of exits from phi > 0 and hardly an entry, and a rate that is three times too
+# high shows in no loss. So after training the probabilities of entering are moved, by a level of each residue's type
+# and of its neighbours', to where as many frames enter as leave in the mean over all training peptides, given the
+# probabilities of leaving and the free energy of phi > 0 (umbrella sampling).
 
 # Frames of either side at which probabilities are read, drawn anew by this seed, and how long after them.
 _SIDE_FRAMES, _SIDE_SEED = 1000, 0
@@ -52,53 +51,45 @@ _RIDGE, _MOST = 0.3, 3.0
 
 @dataclass(frozen=True, eq=False)
 class Phi:
-    """One phi of a peptide: its `residue`, frames well on its negative and on its positive side, as numbers `known` (n,
-    n_residues, n_slots) and `states` (n, n_residues, MOST_TORSIONS) each, and how likely the positive is beside the
+    """One phi of a peptide: its `residue`; frames well on its negative and on its positive side, `observed` (n,
+    n_residues, n_slots) and `states` (n, n_residues, MOST_TORSIONS) of each; and how likely `positive` is beside the
     other."""
 
     chain: chains.ChainFeatures
     residue: int
-    known: tuple[Tensor, ...]
+    observed: tuple[Tensor, ...]
     states: tuple[Tensor, ...]
     positive: float
-
-    @property
-    def places(self) -> list[int]:
-        """The numbers of its residue's type, of the one's before and of the one's after."""
-        return [int(k) for k in self.chain.places[self.residue]]
 
 
 @torch.no_grad()
 def balance_entries(model: PeptideSlide, subjects: Sequence[PeptideSubject]) -> None:
     """Move the probabilities of entering phi > 0 of `model` to where detailed balance holds in the mean over
     `subjects`, whose weights say how likely phi > 0 is; those without weights play no part."""
-    n_types = len(model.token_mean)
     phis = [phi for subject in subjects for phi in weighted_phis(model, subject)]
     if not phis:
         return
-    conditioning = torch.zeros(len(phis), 3 * n_types, dtype=torch.float64)
-    for k, phi in enumerate(phis):
-        for which, place in enumerate(phi.places):
-            conditioning[k, which * n_types + place] = 1.0
-    held = conditioning.T @ conditioning + _RIDGE * torch.eye(3 * n_types, dtype=torch.float64)
+    # Of each phi the types of its residue, of the one before and of the one after.
+    types = torch.zeros(len(phis), 3, len(model.token_mean), dtype=torch.float64)
+    for of_phi, phi in zip(types, phis, strict=True):
+        of_phi[range(3), phi.chain.places[phi.residue].cpu()] = 1.0
+    types = types.flatten(1)
+    held = types.T @ types + _RIDGE * torch.eye(types.shape[1], dtype=torch.float64)
     for _ in range(_PASSES):
         lacking = torch.tensor([lacking_entries(model, phi) for phi in phis], dtype=torch.float64)
-        levels = torch.linalg.solve(held, conditioning.T @ lacking.clamp(-_MOST, _MOST))
+        levels = torch.linalg.solve(held, types.T @ lacking.clamp(-_MOST, _MOST))
         model.jumps.raise_entries(*levels.float().to(model.token_mean.device).chunk(3))
 
 
 def weighted_phis(model: PeptideSlide, subject: PeptideSubject) -> list[Phi]:
-    """Return each phi of a peptide of which frames show both sides and weights say how likely they are; before a
-    proline that is not known well enough."""
-    if subject.weights is None:
-        return []
-    chain, found = subject.chain, []
-    types = (*chain.code.layout.types, "")
-    for residue in chain.signed.tolist():
+    """Return each phi of a peptide of which frames show both sides and weights say how likely they are; none before a
+    proline."""
+    found: list[Phi] = []
+    for residue in subject.chain.signed if subject.weights is not None else ():
         sides = [_side(subject, residue, state) for state in (0, 1)]
-        if types[residue + 1] != "PRO" and min(len(idx) for idx, _ in sides) >= _LEAST_FRAMES:
-            known, states = zip(*(subject.seen(model, idx) for idx, _ in sides), strict=True)
-            found.append(Phi(chain, residue, known, states, sides[1][1] / sides[0][1]))
+        if min(len(idx) for idx, _ in sides) >= _LEAST_FRAMES:
+            observed, states = zip(*(subject.seen(model, idx) for idx, _ in sides), strict=True)
+            found.append(Phi(subject.chain, residue, observed, states, sides[1][1] / sides[0][1]))
     return found
 
 
@@ -118,9 +109,9 @@ def _side(subject: PeptideSubject, residue: int, state: int) -> tuple[Tensor, fl
     total = float(weights.sum())
     if total == 0.0:
         return idx[:0], total
-    probabilities = weights if state == 0 else (weights > 0).double()
+    generator = torch.Generator().manual_seed(_SIDE_SEED)
     drawn = torch.multinomial(
-        probabilities, _SIDE_FRAMES, replacement=True, generator=torch.Generator().manual_seed(_SIDE_SEED)
+        weights if state == 0 else (weights > 0).double(), _SIDE_FRAMES, True, generator=generator
     )
     stated = subject.chain.stated.to(torch.device("cpu"))
     quad = stated.quads[(stated.residue == residue) & (stated.slot == 0)][0]
@@ -133,14 +124,13 @@ def _side(subject: PeptideSubject, residue: int, state: int) -> tuple[Tensor, fl
 def _log_probabilities(model: PeptideSlide, phi: Phi, state: int) -> Tensor:
     """Return the logarithm of how likely, in the mean over frames of one side, a phi is on the other `_TIMES_PS`
     later."""
-    known, now, chain = phi.known[state], phi.states[state], phi.chain
+    observed, now, chain = phi.observed[state], phi.states[state], phi.chain
     counts, before, found = chain.stated.counts, now[:, None], []
     conditioning = chains.conditioning_states(before, counts)
-    common = model.jumps.of_known(known, now, chain.places, counts)[:, None] + model.jumps.of_frames(
-        conditioning, conditioning
-    )
+    common = model.jumps.of_observed(observed, now, chain.places, counts)[:, None]
+    common = common + model.jumps.of_frames(conditioning, conditioning)
     for time_ps in _TIMES_PS:
-        times = torch.full((len(known), 1), time_ps, device=known.device)
+        times = torch.full((len(observed), 1), time_ps, device=observed.device)
         apart = times_apart(times, model.config.forgotten_ps)
         of_times, levels = model.jumps.of_times_alone(times, apart, chain.places, counts)
         logits = model.jumps.probabilities(0, common + of_times[:, :, None], levels, before[..., 0], conditioning)
@@ -167,10 +157,9 @@ _LEAST_SCALE = 0.05
 class PeptideTraining:
     """Optimisation (AdamW, EMA 0.999), in seconds of training or steps.
 
-    `time_reversal`: MD in equilibrium looks alike backwards. Windows are read backwards, too, and frames drawn from
-    equilibrium stand for endless times, both weighted by a Markov model of each molecule (`models.peptides.subjects`).
-    `positive_phi_kt`: of residue types, the free energy of phi > 0 over phi < 0 in kT where it is known (metadynamics);
-    short runs leave that state and hardly ever enter it.
+    `time_reversal`: windows are read backwards, too, and frames drawn from equilibrium stand for endless times, both
+    weighted by a Markov model of each molecule (`models.peptides.subjects`). `positive_phi_kt`: of residue types, the
+    free energy of phi > 0 over phi < 0 in kT, from metadynamics.
     """
 
     budget_s: float | None = None
@@ -186,22 +175,15 @@ class PeptideTraining:
 
 
 def train_peptides(
-    sets: Sequence[TrainingFrames],
-    out: str | Path,
-    config: PeptideConfig,
-    training: PeptideTraining,
-    *,
-    unseen: Sequence[TrainingFrames] = (),
-    start: Weights | None = None,
-    resume: bool = False,
+    sets: Sequence[TrainingFrames], out: str | Path, config: PeptideConfig, training: PeptideTraining, *,
+    unseen: Sequence[TrainingFrames] = (), start: Weights | None = None, resume: bool = False,
     progress: ProgressFn | None = None,
-) -> Path:
+) -> Path:  # fmt: skip
     """Train on frames of several sequences and write `out` (.safetensors); beside it a CSV of the curves: first the
     flow, conditioned on the states of torsions, then the probabilities of these states, which share nothing with it.
 
     `unseen`: sequences held out whole, whose loss the curves show. `start`: weights to go on from, with their scales.
-    Every frame of `sets` outside the split is trained on; windows start anywhere. Raises InputError for scenes that are
-    no chains, SimulationError when training diverges.
+    Raises InputError for scenes that are no chains, SimulationError when training diverges.
     """
     out = Path(out)
     torch.manual_seed(training.seed)
@@ -247,9 +229,9 @@ def train_peptides(
         if which not in pools:
             pools[which] = StateWindows.of(subject, config)
         idx, times, share = pools[which].draw(_JUMPS_BATCH, generator)
-        known, _ = subject.seen(model, idx[:, 0])
+        observed, _ = subject.seen(model, idx[:, 0])
         states = subject.states(idx).to(device)
-        loss = state_loss(model, subject.chain, known, states, times.to(device), generator, share=share.to(device))
+        loss = state_loss(model, subject.chain, observed, states, times.to(device), generator, share=share.to(device))
         return loss, {"jumps": loss.detach()}
 
     @torch.no_grad()
@@ -316,13 +298,13 @@ def with_scale(config: PeptideConfig, sets: Sequence[TrainingFrames]) -> Peptide
 
 
 def _go_on_from(start: PeptideSlide, model: PeptideSlide) -> None:
-    """Give `model` the weights of `start`, and for the numbers that this knows its means, scales and correlations."""
+    """Give `model` the weights of `start`, and for the numbers that this has its means, scales and correlations."""
     own = {name: tensor.clone() for name, tensor in model.named_buffers()}
-    known = model.state_dict()
+    whole = model.state_dict()
     with torch.no_grad():
         for name, tensor in start.state_dict().items():
-            # Numbers that are new come after those that are known.
-            known[name][tuple(slice(n) for n in tensor.shape)] = tensor
+            # New numbers come after those of `start`.
+            whole[name][tuple(slice(n) for n in tensor.shape)] = tensor
     assert start.config.scale is not None and model.config.scale is not None
     for key in model.config.scale.slots.keys() - start.config.scale.slots.keys():
         places = _places(model.config, key)
@@ -334,21 +316,18 @@ def _places(config: PeptideConfig, key: str) -> tuple[slice, EllipsisType, slice
     """Return where a coordinate's numbers stand in `(n_types, ..., n_slots)`: of its residue's type, or, where it is a
     free end's, of all."""
     assert config.scale is not None
-    slot, kind = config.scale.slots[key], key.split()[0]
+    slot, bearer = config.scale.slots[key], key.split()[0]
     types = slice(None)
-    if kind not in chains.FREE_ENDS:
-        at = (*ENDS, *config.types).index(kind)
+    if bearer not in chains.FREE_ENDS:
+        at = (*ENDS, *config.types).index(bearer)
         types = slice(at, at + 1)
     return types, ..., slice(slot, slot + (1 if key in config.scale.mean else 2))
 
 
 @torch.no_grad()
 def normalise(model: PeptideSlide, subjects: Sequence[PeptideSubject], seed: int) -> None:
-    """Measure what centres and scales each residue type's numbers, and their correlations in time, and set them.
-
-    A torsion's cosine and sine share one scale, the root of their mean variance, and one correlation; a free end's
-    numbers are alike in residues of all types.
-    """
+    """Measure what centres and scales each residue type's numbers, and their correlations in time, and set them. A
+    torsion's cosine and sine share one scale and one correlation; a free end's numbers are alike in all residues."""
     assert model.config.scale is not None
     slots = model.config.scale.slots
     of_ends = [_places(model.config, key) for key in slots if key.split()[0] in chains.FREE_ENDS]
@@ -361,13 +340,12 @@ def normalise(model: PeptideSlide, subjects: Sequence[PeptideSubject], seed: int
         _count_middles(sums, subject)
         frames = torch.from_numpy(subject.frames.some_nm(_MEASURED_FRAMES // len(subjects) + _LEAST_MEASURED))
         tokens, states = subject.chain.code.encode(frames).double(), subject.chain.states(frames)
-        at = subject.chain.state_at
-        own = torch.where(at < 0, 0, states.gather(-1, at.clamp(min=0).expand(len(states), -1, -1)))
-        for r, kind in enumerate(subject.chain.places[:, 0].tolist()):
+        own = subject.chain.state_of_numbers(states)
+        for r, number in enumerate(subject.chain.places[:, 0].tolist()):
             for state in range(chains.MOST_STATES):
                 inside = (own[:, r] == state) & subject.chain.code.filled[r]
                 for power in range(3):
-                    sums[power, kind, state] += (tokens[:, r].pow(power) * inside).sum(0)
+                    sums[power, number, state] += (tokens[:, r].pow(power) * inside).sum(0)
     for _, _, place in of_ends:
         sums[..., place] = sums[..., place].sum(1, keepdim=True)
     mean = sums[1] / sums[0].clamp(min=1)
@@ -389,10 +367,10 @@ def normalise(model: PeptideSlide, subjects: Sequence[PeptideSubject], seed: int
                 continue
             first = torch.from_numpy(rng.choice(starts, size=min(_MEASURED_PAIRS // len(subjects) + 100, len(starts))))
             both = subject.seen(model, torch.stack([first, first + lag]))[0].double()
-            for r, kind in enumerate(subject.chain.places[:, 0].tolist()):
+            for r, number in enumerate(subject.chain.places[:, 0].tolist()):
                 x, y = both[0, :, r], both[1, :, r]
                 for what, value in enumerate((x * y, x * x, y * y)):
-                    products[what, kind, k] += value.sum(0)
+                    products[what, number, k] += value.sum(0)
     for _, _, place in of_ends:
         products[..., place] = products[..., place].sum(1, keepdim=True)
     for places in of_turning:
@@ -405,9 +383,9 @@ def _count_middles(sums: Tensor, subject: PeptideSubject) -> None:
     """Count one frame in the middle of each state, so that states never seen have a mean."""
     stated, slots = subject.chain.stated, subject.chain.state_at
     for residue, slot, middles in zip(stated.residue.tolist(), stated.slot.tolist(), stated.middles_deg, strict=True):
-        kind, at = int(subject.chain.places[residue, 0]), int(torch.nonzero(slots[residue] == slot)[0])
+        number, at = int(subject.chain.places[residue, 0]), int(torch.nonzero(slots[residue] == slot)[0])
         for place, value in ((at, middles.deg2rad().cos()), (at + 1, middles.deg2rad().sin())):
-            sums[:, kind, :, place] += torch.stack([value**power for power in range(3)]).double()
+            sums[:, number, :, place] += torch.stack([value**power for power in range(3)]).double()
 
 
 def peptide_loss(
@@ -421,19 +399,17 @@ def peptide_loss(
     frame is disturbed as in training. Returns the loss and its parts: of torsions' numbers, of stiff ones.
     """
     c, filled = model.config, chain.code.filled
-    known, later = numbers[:, 0], numbers[:, 1:]
+    observed, later = numbers[:, 0], numbers[:, 1:]
     if noisy:
-        known = disturbed(known, chain, c, generator)
-    target = model.innovations(later, known, times_ps, chain.places[:, 0])
+        observed = disturbed(observed, chain, c, generator)
+    target = model.innovations(later, observed, times_ps, chain.places[:, 0])
     draws = torch.randn(len(numbers), generator=generator) * c.tau_scale + c.tau_location
     tau = torch.sigmoid(draws).clamp(max=TAU_MAX).to(numbers.device)
     noise = torch.randn(target.shape, generator=generator).to(numbers.device) * filled
-    alpha, sigma, _, _ = (flow.expand(v, target) for v in flow.coefficients(tau, "linear"))
-    conditioning = model.flow.conditioning(
-        known, times_ps, chain.places, chains.conditioning_states(states, chain.stated.counts)
-    )
-    found = model.flow(alpha * target + sigma * noise, tau, conditioning)
-    weight = flow.expand(flow.preconditioning(tau, "linear")[1].square().reciprocal(), target)
+    of_states = chains.conditioning_states(states, chain.stated.counts)
+    conditioning = model.flow.conditioning(observed, times_ps, chain.places, of_states)
+    found = model.flow(flow.mixed(target, noise, tau), tau, conditioning)
+    weight = flow.expand(flow.preconditioning(tau)[1].square().reciprocal(), target)
     loss, turning, stiff = by_kind((found - target).square() * weight, chain, c)
     return loss, {"flow": loss.detach(), "turning": turning.detach(), "stiff": stiff.detach()}
 
@@ -441,32 +417,31 @@ def peptide_loss(
 def by_kind(error: Tensor, chain: chains.ChainFeatures, config: PeptideConfig) -> tuple[Tensor, Tensor, Tensor]:
     """Return the mean of squared errors `(b, t, r, slots)` in which torsions count more, that of torsions alone, and
     that of stiff numbers."""
-    filled = chain.code.filled
-    turning = torch.zeros_like(filled).flatten()
-    turning[chain.code.turning_at] = turning[chain.code.turning_at + 1] = True
-    turning = turning.reshape(filled.shape)
-    of_turning, of_stiff = (error[..., which].mean() for which in (turning, filled & ~turning))
-    share = config.turning_weight * turning.sum() / (config.turning_weight * turning.sum() + (filled & ~turning).sum())
+    turning, stiff = chain.code.filled_turning, chain.code.filled_stiff
+    of_turning, of_stiff = (error[..., which].mean() for which in (turning, stiff))
+    share = config.turning_weight * turning.sum() / (config.turning_weight * turning.sum() + stiff.sum())
     return share * of_turning + (1 - share) * of_stiff, of_turning, of_stiff
 
 
 def state_loss(
-    model: PeptideSlide, chain: chains.ChainFeatures, known: Tensor, states: Tensor, times_ps: Tensor,
+    model: PeptideSlide, chain: chains.ChainFeatures, observed: Tensor, states: Tensor, times_ps: Tensor,
     generator: torch.Generator, *, noisy: bool = True, share: Tensor | None = None,
 ) -> Tensor:  # fmt: skip
-    """Return the negative log-likelihood of the changes of states: `known` (b, r, slots) the given frame's numbers,
+    """Return the negative log-likelihood of the changes of states: `observed` (b, r, slots) the given frame's numbers,
     `states` (b, 1 + t, r, MOST_TORSIONS), `times_ps` (b, t), `share` (b, r, MOST_TORSIONS) what each change counts,
     1 where it is not given; otherwise as `peptide_loss`."""
     if noisy:
-        known = disturbed(known, chain, model.config, generator)
+        observed = disturbed(observed, chain, model.config, generator)
     apart = times_apart(times_ps, model.config.forgotten_ps)
-    return model.jumps.loss(known, states, chain.places, chain.stated.counts, times_ps, apart, share)
+    return model.jumps.loss(observed, states, chain.places, chain.stated.counts, times_ps, apart, share)
 
 
-def disturbed(known: Tensor, chain: chains.ChainFeatures, config: PeptideConfig, generator: torch.Generator) -> Tensor:
+def disturbed(
+    observed: Tensor, chain: chains.ChainFeatures, config: PeptideConfig, generator: torch.Generator
+) -> Tensor:
     """Return the given frame's numbers `(b, r, slots)` with the noise that training adds."""
-    noise = torch.randn(known.shape, generator=generator).to(known.device)
-    return known + config.conditioning_noise * chain.code.filled * noise
+    noise = torch.randn(observed.shape, generator=generator).to(observed.device)
+    return observed + config.conditioning_noise * chain.code.filled * noise
 
 
 # Share of the longest trajectory that a window may span: its end is held out.
@@ -480,31 +455,27 @@ class PeptideTrainer(arch.Trainer):
     learns_lags = True
 
     def choose(self, references: References, request: arch.TrainingRequest) -> tuple[arch.Choice, ...]:
-        """See `Trainer.choose`."""
-        survey, known = references.survey, PeptideConfig()
-        found = []
-        going_on = request.start_from is not None
-        if not going_on and "shortest_ps" not in request.model and survey.lag_ps != known.shortest_ps:
+        survey, found = references.survey, list[arch.Choice]()
+        begins = request.start_from is None
+        if begins and "shortest_ps" not in request.model and survey.lag_ps != PeptideConfig.shortest_ps:
             found.append(arch.Choice("model.shortest_ps", survey.lag_ps, "the references' spacing of frames"))
-        if not going_on and "longest_ps" not in request.model:
+        if begins and "longest_ps" not in request.model:
             reach = int(_SPAN * min(survey.longest)) * survey.lag_ps
             if request.longest_lag_ps is not None:
                 found.append(arch.Choice("model.longest_ps", request.longest_lag_ps, "`longest_lag_ps`"))
-            elif reach < known.longest_ps:
+            elif reach < PeptideConfig.longest_ps:
                 found.append(arch.Choice("model.longest_ps", reach, "as far as every reference reaches"))
         if "time_reversal" not in request.training and survey.equilibrium:
             found.append(REVERSIBLE)
         return tuple(found)
 
     def settings(self, request: arch.TrainingRequest) -> arch.Settings:
-        """See `Trainer.settings`."""
         model = request.model if request.start_from is None else read_header(request.start_from).config
         if request.start_from is not None:  # trained further, a flow forgets the few steps that it was distilled to
             model = {key: value for key, value in model.items() if key not in ("usual_steps", "usual_solver")}
         return arch.Settings(PeptideConfig.from_dict(model), request.settings(PeptideTraining), arch.RESOLVED)
 
     def prepare(self, references: References, request: arch.TrainingRequest) -> arch.Prepared:
-        """See `Trainer.prepare`."""
         settings, sets = self.settings(request), references.sets()
         start = None if request.start_from is None else load_weights(request.start_from)
 
@@ -530,7 +501,7 @@ def _under_standard_names(frames: TrainingFrames) -> TrainingFrames:
     )  # fmt: skip
 
 
-def _suits(survey: Survey) -> arch.Suitability | None:
+def _suits(survey: Survey) -> tuple[int, str] | None:
     if len(survey.scenes) < 2:
         return None
     try:
@@ -538,7 +509,7 @@ def _suits(survey: Survey) -> arch.Suitability | None:
             chain_layout(scene)
     except InputError:
         return None
-    return arch.Suitability(10, f"{len(survey.scenes)} peptides, known by their residues in internal coordinates")
+    return 10, f"{len(survey.scenes)} peptides, known by their residues in internal coordinates"
 
 
 PEPTIDES = arch.Architecture("lam-slide-peptides", PeptideConfig.from_dict, PeptideSlide, PeptideTrainer, _suits)

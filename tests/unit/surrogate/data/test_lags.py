@@ -33,7 +33,7 @@ def weights(harmonic_frames: TrainingFrames, small_model_config: LamSlideConfig,
     trained = load_weights(train_lam_slide(harmonic_frames, out, small_model_config, QUICK))
     # After a second of training it hardly moves, for which guards would stop it.
     domain = replace(trained.domain, jumps=tuple((lag, 1e-9, 1.0) for lag, _, _ in trained.domain.jumps))
-    # What starts at zero has hardly left it: filled, so that what the flow is told carries signal.
+    # What starts at zero has hardly left it: filled, so that what the flow is conditioned on carries signal.
     with torch.no_grad():
         for layer in (trained.model.approximator.modulation, trained.model.approximator.final):
             layer.weight.normal_(std=0.1, generator=torch.Generator().manual_seed(0))
@@ -121,7 +121,7 @@ def test_a_rollout_steps_at_the_interval_that_is_kept(weights: Weights, alanine_
     assert np.abs(finer - kept).max() > 1e-5
     every, times, _ = roll("one.h5")
     assert len(every) == 70 and times[0] == 1.0
-    # The first chunk has the same noise and start at each lag: what differs is what the network is told.
+    # The first chunk has the same noise and start at each lag: what differs is the lag that the network takes.
     assert np.abs(every[:7] - kept).max() > 1e-5
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from surrogate.data import FrameSets, collect_frames, collect_sets, in_standard_pose
+from surrogate.data import FrameSets, References, collect_frames, in_standard_pose
 from systems.errors import InputError
 from systems.prepare.molecule import scene_from_smiles
 from systems.scene import Scene
@@ -51,23 +51,23 @@ def test_a_held_out_system_that_is_trained_on_in_another_order_is_refused(write:
                     masses_da=scene.masses_da[order], bonds=np.sort(np.argsort(order)[scene.bonds]))  # fmt: skip
     plain, turned = write(scene, "ethanol"), write(other, "ethanol-turned", seed=3)
     with pytest.raises(InputError, match="both trained on and held out"):
-        collect_sets([plain], held=[turned])
+        References((plain,), (turned,)).sets()
     with pytest.raises(InputError, match="one molecule in two atom orders"):
-        collect_sets([plain, turned])
+        References((plain, turned)).sets()
     # The same order is a second trajectory of the molecule, held out for validation.
     again = write(scene, "ethanol-again", seed=4)
-    sets = collect_sets([plain], held=[again])
+    sets = References((plain,), (again,)).sets()
     assert len(sets.trained) == 1 and sets.trained[0].split.held == (1,)
     with pytest.raises(InputError, match="held out for validation and trained on"):
-        collect_sets([plain], held=[plain])
+        References((plain,), (plain,)).sets()
 
 
 def test_mixtures_that_no_model_can_learn_are_refused(write: Write) -> None:
     ethanol = write(smiles("CCO"), "ethanol")
     with pytest.raises(InputError, match="every 2 ps"):
-        collect_sets([ethanol, write(smiles("CCC"), "propane-2ps", lag_ps=2.0)])
+        References((ethanol, write(smiles("CCC"), "propane-2ps", lag_ps=2.0))).sets()
     with pytest.raises(InputError, match="350"):
-        collect_sets([ethanol, write(smiles("CCC"), "propane-hot", kelvin=350.0)])
+        References((ethanol, write(smiles("CCC"), "propane-hot", kelvin=350.0))).sets()
 
 
 def test_the_standard_pose_follows_the_molecule(write: Write) -> None:
@@ -82,7 +82,7 @@ def test_the_standard_pose_follows_the_molecule(write: Write) -> None:
         mirrored = in_standard_pose(scene.with_positions(scene.positions_nm * [1, 1, -1]))
         assert np.abs(mirrored.positions_nm - base.positions_nm).max() > 0.02, "a mirror image is another shape"
     path = write(smiles("CCCO"), "propanol")
-    posed, plain = collect_sets([path]).trained[0], collect_frames([path])
+    posed, plain = References((path,)).sets().trained[0], collect_frames([path])
     idx = np.arange(5)
     assert np.abs(posed.positions_nm(idx).mean(0) - posed.scene.positions_nm).max() < 0.02
     apart = lambda x: np.linalg.norm(x[:, :, None] - x[:, None], axis=-1)  # noqa: E731

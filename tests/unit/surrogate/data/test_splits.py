@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import csv
 import tracemalloc
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from surrogate import api
-from surrogate.data import RUN, Split, TrainingFrames, collect_frames, load_frames, refuse_leaks, write_windows
+from surrogate.data import RUN, Split, TrainingFrames, collect_frames, load_frames
 from surrogate.models.lam_slide.model import LamSlideConfig
 from surrogate.models.lam_slide.trainer import TrainingConfig, train_lam_slide
 from systems.errors import InputError
@@ -40,13 +41,14 @@ def test_splits_part_the_frames() -> None:
         Split(1.0)
 
 
-def test_leaks_are_refused() -> None:
+def test_leaks_are_refused(harmonic_frames: TrainingFrames) -> None:
     rng = np.random.default_rng(0)
     run, other = (rng.integers(-3000, 3000, size=(400, 5, 3)).astype(np.int16) for _ in range(2))
 
     def check(*pieces: np.ndarray, split: Split | None = None) -> None:
         starts = np.concatenate([[0], np.cumsum([len(p) for p in pieces])])
-        refuse_leaks(np.concatenate(pieces), starts, split or Split(0.1), lambda k: f"run {k}")
+        replace(harmonic_frames, coordinates=np.concatenate(pieces), starts=starts, split=split or Split(0.1),
+                sources=tuple({"file": f"run {k}"} for k in range(len(pieces)))).refuse_leaks()  # fmt: skip
 
     check(run, other)
     check(run, run)  # the same trajectory twice parts at the same place: wasteful, no leak
@@ -118,7 +120,7 @@ def test_training_without_a_cache_of_latents_is_the_same(tmp_path: Path, harmoni
 def test_written_windows_equal_collected_frames(tmp_path: Path, alanine_dipeptide: Scene) -> None:
     paths = [write(tmp_path / f"{k}.h5", alanine_dipeptide, 30 + k, seed=k) for k in range(3)]
     for canonical in (True, False):
-        write_windows(paths, tmp_path / "w.h5", canonical=canonical)
+        api.windows(paths, tmp_path / "w.h5", canonical=canonical, overwrite=True)
         found, expected = load_frames(tmp_path / "w.h5"), collect_frames(paths, canonical=canonical)
         assert np.array_equal(found.coordinates, expected.coordinates)
         assert (found.lag_ps, found.split, found.sources) == (expected.lag_ps, expected.split, expected.sources)

@@ -1,4 +1,4 @@
-"""Interpolants and solver against cases with known answers."""
+"""Interpolant and solvers against cases with known answers."""
 
 from __future__ import annotations
 
@@ -14,52 +14,41 @@ from surrogate.models.lam_slide import flow
 MEAN, STD = 1.5, 0.4
 
 
-def gaussian_posterior(interpolant: str, std: float = STD, mean: float = MEAN):
+def gaussian_posterior(std: float = STD, mean: float = MEAN):
     """E[o1 | o_tau] for data N(mean, std^2): the exact data prediction."""
 
     def predict(o: Tensor, tau: Tensor) -> Tensor:
-        alpha, sigma, _, _ = (flow.expand(c, o) for c in flow.coefficients(tau, interpolant))
+        alpha = flow.expand(tau, o)
+        sigma = 1.0 - alpha
         gain = alpha * std**2 / (alpha**2 * std**2 + sigma**2)
         return mean + gain * (o - alpha * mean)
 
     return predict
 
 
-@pytest.mark.parametrize("interpolant", ["linear", "gvp"])
-def test_paths_start_at_noise_and_end_at_data(interpolant: str) -> None:
-    ends = torch.tensor([0.0, 1.0])
-    alpha, sigma, _, _ = flow.coefficients(ends, interpolant)
-    torch.testing.assert_close(alpha, torch.tensor([0.0, 1.0]), atol=1e-6, rtol=0)
-    torch.testing.assert_close(sigma, torch.tensor([1.0, 0.0]), atol=1e-6, rtol=0)
+def test_paths_start_at_noise_and_end_at_data() -> None:
+    data, noise = torch.randn(2, 3, 4, generator=torch.Generator().manual_seed(0))
+    assert torch.equal(flow.mixed(data, noise, torch.zeros(3)), noise)
+    assert torch.equal(flow.mixed(data, noise, torch.ones(3)), data)
+    torch.testing.assert_close(flow.mixed(data, noise, torch.full((3,), 0.25)), 0.25 * data + 0.75 * noise)
 
 
-@pytest.mark.parametrize("interpolant", ["linear", "gvp"])
-def test_derivatives_match_finite_differences(interpolant: str) -> None:
-    tau = torch.linspace(0.05, 0.95, 7, dtype=torch.float64)
-    h = 1e-6
-    _, _, d_alpha, d_sigma = flow.coefficients(tau, interpolant)
-    up, down = flow.coefficients(tau + h, interpolant), flow.coefficients(tau - h, interpolant)
-    torch.testing.assert_close(d_alpha, (up[0] - down[0]) / (2 * h), atol=1e-8, rtol=0)
-    torch.testing.assert_close(d_sigma, (up[1] - down[1]) / (2 * h), atol=1e-8, rtol=0)
-
-
-@pytest.mark.parametrize("interpolant", ["linear", "gvp"])
-def test_velocity_equals_equations_10_and_11(interpolant: str) -> None:
+def test_velocity_equals_equations_10_and_11() -> None:
     generator = torch.Generator().manual_seed(0)
     o, data = torch.randn(2, 5, 4, generator=generator, dtype=torch.float64)
     tau = torch.linspace(0.1, 0.9, 5, dtype=torch.float64)
-    alpha, sigma, d_alpha, d_sigma = (flow.expand(c, o) for c in flow.coefficients(tau, interpolant))
+    alpha = flow.expand(tau, o)
+    sigma, d_alpha, d_sigma = 1.0 - alpha, 1.0, -1.0
     score = -(sigma**-2) * (o - alpha * data)
     paper = score * (d_alpha * sigma**2 / alpha - sigma * d_sigma) + d_alpha / alpha * o
-    torch.testing.assert_close(flow.velocity(o, data, tau, interpolant), paper)
+    torch.testing.assert_close(flow.velocity(o, data, tau), paper)
 
 
-@pytest.mark.parametrize("interpolant", ["linear", "gvp"])
-def test_euler_carries_noise_to_the_data_distribution_and_converges(interpolant: str) -> None:
+def test_euler_carries_noise_to_the_data_distribution_and_converges() -> None:
     noise = torch.randn(20_000, 1, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     errors = []
     for n_steps in (8, 16, 32, 64, 128):
-        sample = flow.euler(gaussian_posterior(interpolant), noise, n_steps, interpolant)
+        sample = flow.euler(gaussian_posterior(), noise, n_steps)
         errors.append(abs(float(sample.std()) / float(noise.std()) - STD))
     assert errors[-1] < 0.01
     assert abs(float(sample.mean()) - MEAN - STD * float(noise.mean())) < 0.01
@@ -72,9 +61,8 @@ def test_preconditioning_is_the_best_linear_denoiser_of_unit_data() -> None:
     data, noise = torch.randn(2, 200_000, generator=generator)
     for value in (0.1, 0.5, 0.9):
         tau = torch.tensor([value])
-        alpha, sigma, _, _ = flow.coefficients(tau, "linear")
-        skip, out, scale_in = flow.preconditioning(tau, "linear")
-        noisy = alpha * data + sigma * noise
+        skip, out, scale_in = flow.preconditioning(tau)
+        noisy = flow.mixed(data, noise, tau.expand(len(data)))
         assert float((noisy * scale_in).std()) == pytest.approx(1.0, abs=0.01)
         residual = data - skip * noisy
         assert float(residual.std() / out) == pytest.approx(1.0, abs=0.01)
@@ -82,11 +70,9 @@ def test_preconditioning_is_the_best_linear_denoiser_of_unit_data() -> None:
         assert abs(float((residual * noisy).mean())) < 0.01
 
 
-def test_unknown_interpolant_is_refused() -> None:
-    with pytest.raises(ValueError, match="unknown interpolant"):
-        flow.coefficients(torch.tensor([0.5]), "cubic")
+def test_no_steps_are_refused() -> None:
     with pytest.raises(ValueError, match="at least 1"):
-        flow.euler(gaussian_posterior("linear"), torch.zeros(1, 1), 0, "linear")
+        flow.euler(gaussian_posterior(), torch.zeros(1, 1), 0)
 
 
 def test_rotations_are_uniform_over_so3() -> None:
@@ -112,29 +98,28 @@ def test_multistep_keeps_narrow_directions_wide(width: float) -> None:
     def error(sample: Tensor) -> float:
         return abs(float(sample.std() / noise.std()) / width - 1.0)
 
-    predict = gaussian_posterior("linear", width)
-    errors = [error(flow.multistep(predict, noise, n, "linear")) for n in (10, 20, 40, 80)]
+    predict = gaussian_posterior(width)
+    errors = [error(flow.multistep(predict, noise, n)) for n in (10, 20, 40, 80)]
     assert errors[0] < 0.14 and errors[1] < 0.016
     # Second order once the steps are fine enough.
     assert errors[3] < 0.35 * errors[2], errors
     # Negative control: Euler's even steps.
-    assert error(flow.euler(predict, noise, 20, "linear")) > 4 * errors[1]
-    sample = flow.multistep(predict, noise, 40, "linear")
+    assert error(flow.euler(predict, noise, 20)) > 4 * errors[1]
+    sample = flow.multistep(predict, noise, 40)
     assert abs(float(sample.mean()) - MEAN - width * float(noise.mean())) < 0.002
 
 
-def test_one_multistep_lands_on_the_prediction_as_eulers_does() -> None:
+@pytest.mark.parametrize("solver", ["multistep", "fitted"])
+def test_one_step_lands_on_the_prediction_as_eulers_does(solver: str) -> None:
     noise = torch.randn(7, 2, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-    predict = gaussian_posterior("linear")
-    torch.testing.assert_close(flow.multistep(predict, noise, 1, "linear"), flow.euler(predict, noise, 1, "linear"))
-    with pytest.raises(ValueError, match="gvp"):
-        flow.multistep(predict, noise, 4, "gvp")
+    predict = gaussian_posterior()
+    torch.testing.assert_close(flow.SOLVERS[solver](predict, noise, 1), flow.euler(predict, noise, 1))
 
 
 def relative_width(solver: str, width: float, n_steps: int) -> float:
     """Return how wide Gaussian data of this width come out, over that: linear in the noise, so exact."""
     noise = torch.randn(50, 1, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-    sample = flow.SOLVERS[solver](gaussian_posterior("linear", width), noise, n_steps, "linear")
+    sample = flow.SOLVERS[solver](gaussian_posterior(width), noise, n_steps)
     assert abs(float(sample.mean()) - MEAN - float(sample.std() / noise.std()) * float(noise.mean())) < 1e-6
     return float(sample.std() / noise.std()) / width
 
@@ -185,7 +170,7 @@ def test_gaussian_steps_keep_unit_variance_and_multistep_does_not(n_steps: int) 
 def test_angular_steps_are_exact_for_unit_variance_and_of_second_order_for_others(n_steps: int) -> None:
     def width_of(solver: str, width: float, n_steps: int) -> float:
         noise = torch.linspace(-2.0, 2.0, 9, dtype=torch.float64)[:, None]
-        sample = flow.SOLVERS[solver](gaussian_posterior("linear", width, mean=0.0), noise, n_steps, "linear")
+        sample = flow.SOLVERS[solver](gaussian_posterior(width, mean=0.0), noise, n_steps)
         return float(sample.std() / noise.std())
 
     assert width_of("angular", 1.0, n_steps) == pytest.approx(1.0, abs=1e-6)
@@ -194,8 +179,6 @@ def test_angular_steps_are_exact_for_unit_variance_and_of_second_order_for_other
         errors = [abs(width_of("angular", width, n) - width) for n in (20, 40, 80)]
         assert all(0.15 < fine / coarse < 0.35 for coarse, fine in pairwise(errors)), errors
         assert errors[-1] < 0.002
-    with pytest.raises(ValueError, match="gvp"):
-        flow.angular(gaussian_posterior("linear"), torch.zeros(1, 1), n_steps, "gvp")
 
 
 @pytest.mark.parametrize("width", [2.0, 0.4, 0.2])
@@ -203,38 +186,3 @@ def test_fitted_is_of_second_order(width: float) -> None:
     errors = [abs(relative_width("fitted", width, n) - 1) for n in (40, 80, 160)]
     assert all(0.15 < fine / coarse < 0.42 for coarse, fine in pairwise(errors)), errors
     assert errors[-1] < 0.01
-
-
-def test_one_fitted_step_lands_on_the_prediction() -> None:
-    noise = torch.randn(7, 2, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-    predict = gaussian_posterior("linear")
-    torch.testing.assert_close(flow.fitted(predict, noise, 1, "linear"), flow.euler(predict, noise, 1, "linear"))
-    with pytest.raises(ValueError, match="gvp"):
-        flow.fitted(predict, noise, 4, "gvp")
-    assert "fitted" not in flow.solvers_for("gvp") and flow.solvers_for("linear")[0] == "multistep"
-
-
-@pytest.mark.parametrize("interpolant", ["linear", "gvp"])
-def test_adaptive_steps_carry_noise_to_the_data_distribution(interpolant: str) -> None:
-    """Linear in the noise: the ratio of the widths is exact but for the tolerance."""
-    noise = torch.randn(100, 1, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-    exact = gaussian_posterior(interpolant, 0.2)
-    calls = 0
-
-    def predict(o: Tensor, tau: Tensor) -> Tensor:
-        nonlocal calls
-        calls += 1
-        return exact(o, tau)
-
-    def error(sample: Tensor) -> float:
-        return abs(float(sample.std() / noise.std()) / 0.2 - 1.0)
-
-    errors, counts = [], []
-    for n_steps in (20, 2000):
-        calls = 0
-        errors.append(error(flow.dopri5(predict, noise, n_steps, interpolant)))
-        counts.append(calls)
-    assert errors[0] < 0.01 and errors[1] < 1e-4, errors
-    assert 10 < counts[0] < counts[1] < 300, counts
-    # Negative control: as many even Euler steps as the finer took are further off.
-    assert error(flow.euler(exact, noise, counts[1], interpolant)) > 10 * errors[1]

@@ -155,18 +155,6 @@ def test_a_resumed_training_equals_an_uninterrupted_one(tmp_path: Path, diatomic
     assert not torch.equal(load_weights(other).model.state_dict()["embed_frame"], first["embed_frame"])
 
 
-def test_a_further_training_begins_with_the_weights_it_is_given(tmp_path: Path, diatomic: Scene) -> None:
-    frames = frames_of(diatomic)
-    first = load_weights(train_painet(frames, tmp_path / "first.safetensors", SMALL, QUICK))
-    still = replace(QUICK, steps=1, learning_rate=1e-12)
-    second = load_weights(train_painet(frames, tmp_path / "second.safetensors", SMALL, still, start=first))
-    before, after = first.model.state_dict(), second.model.state_dict()
-    assert all(torch.allclose(before[name], after[name], atol=1e-9) for name in before)
-    assert second.provenance["from"]["hash"] == first.hash
-    with pytest.raises(InputError, match="another configuration"):
-        train_painet(frames, tmp_path / "third.safetensors", replace(SMALL, width=24), still, start=first)
-
-
 def test_windows_hold_states_and_futures_at_the_stride(diatomic: Scene) -> None:
     frames = frames_of(diatomic, n_frames=160)
     windows = StateWindows(frames, replace(SMALL, frame_stride=2), torch.device("cpu"))

@@ -16,18 +16,17 @@ from surrogate.models.weights import Weights, load_weights
 from surrogate.sampling.chunks import ChunkSampler
 from surrogate.sampling.runner import RolloutConfig, rollout
 from surrogate.training import devices as precision
-from surrogate.training.devices import ProductSpeed, bf16_pays, bf16_unit, choose_precision, product_speed
+from surrogate.training.devices import bf16_pays, choose_precision, product_speed
 from surrogate.verbs.info import describe_file
 from systems.errors import InputError
 from systems.scene import Scene
 from systems.trajectory.checkpoint import checkpoint_path, read_checkpoint
 from systems.trajectory.codec import open_trajectory
 
-FAST = ProductSpeed("avx512_bf16", 70.0, 280.0, 1)
-SLOW = ProductSpeed("", 70.0, 14.0, 1)
+FAST, SLOW = (70.0, 280.0), (70.0, 14.0)
 
 
-def processor(monkeypatch: pytest.MonkeyPatch, speed: ProductSpeed) -> None:
+def processor(monkeypatch: pytest.MonkeyPatch, speed: tuple[float, float]) -> None:
     monkeypatch.setattr(precision, "product_speed", lambda: speed)
 
 
@@ -35,7 +34,7 @@ def test_bf16_is_chosen_where_its_products_are_faster(monkeypatch: pytest.Monkey
     processor(monkeypatch, FAST)
     chosen = choose_precision("auto")
     assert (chosen.bf16, chosen.name) == (True, "bf16")
-    assert chosen.reason == "products in bf16 through avx512_bf16 are 4 times as fast as in fp32 here"
+    assert chosen.reason == "products in bf16 are 4 times as fast as in fp32 here"
     assert bf16_pays("cpu")
     assert not choose_precision("auto", suits=False).bf16, "a model that is integrated is left alone"
     processor(monkeypatch, SLOW)
@@ -48,14 +47,11 @@ def test_bf16_is_chosen_where_its_products_are_faster(monkeypatch: pytest.Monkey
         choose_precision("fp16")
 
 
-def test_a_processor_of_either_kind_is_told() -> None:
-    """Where oneDNN may use what torch knows of, products are faster; where it may not, they are not."""
+def test_products_are_slower_in_bf16_where_the_processor_may_not_use_its_units() -> None:
     here = product_speed()
     assert here is product_speed(), "measured once"
-    assert here.fp32_gflops > 0 and here.bf16_gflops > 0 and here.unit == bf16_unit()
-    assert "GFLOP/s" in here.describe()
-    if here.unit and "ONEDNN_MAX_CPU_ISA" not in os.environ:
-        assert choose_precision("auto").bf16, here
+    assert min(here) > 0.0
+    if choose_precision("auto").bf16 and "ONEDNN_MAX_CPU_ISA" not in os.environ:
         code = "from surrogate.training.devices import choose_precision as c; print(c('auto').name)"
         held_back = os.environ | {"ONEDNN_MAX_CPU_ISA": "AVX2", "PYTHONPATH": str(Path(__file__).parents[4])}
         said = subprocess.run([sys.executable, "-c", code], env=held_back, capture_output=True, text=True, check=True)
@@ -105,7 +101,7 @@ def test_the_record_says_which_and_why_and_resume_keeps_it(
     with open_trajectory(fresh) as reader:
         assert reader.record["precision"] == "bf16"
         assert "4 times as fast" in reader.record["precision_reason"]
-    assert "network in bf16: products in bf16 through avx512_bf16" in describe_file(fresh)["details"][0]
+    assert "network in bf16: products in bf16 are 4 times" in describe_file(fresh)["details"][0]
 
 
 def test_measuring_leaves_random_numbers_alone() -> None:

@@ -15,7 +15,7 @@ from surrogate.data import TrainingFrames, collect_frames, is_windows, load_fram
 from surrogate.models.lam_slide.model import LamSlide, LamSlideConfig, draw_identifiers
 from surrogate.models.lam_slide.trainer import TrainingConfig, flow_loss, train_lam_slide, window_frames
 from surrogate.models.weights import Weights, load_weights, provenance_of, read_header, save_weights
-from surrogate.training.loop import StageConfig, StagePlace, learning_rate_factor, run_stage
+from surrogate.training.loop import Stage, StageConfig, StagePlace, learning_rate_factor, run_stage
 from systems.errors import InputError, SimulationError, WeightsError
 from systems.options import read_toml
 from systems.scene import Scene
@@ -83,20 +83,20 @@ def test_training_goes_on_from_weights(tmp_path: Path, harmonic_frames: Training
 
 
 def test_weights_tell_each_trajectory_of_their_ancestors_once(small_weights: Weights) -> None:
-    def told(*files: str, **more: Any) -> dict[str, Any]:
+    def sources(*files: str, **more: Any) -> dict[str, Any]:
         return {"sources": [{"file": name, "sha256": name} for name in files], **more}
 
-    eldest = {"hash": "0", **told("a", "b"), "spent_s": 1.0}
-    start = replace(small_weights, provenance=told("b", "c", **{"from": eldest, "spent_s": 2.0}), hash="1")
-    made = provenance_of(told("c", "d"), {}, start)
+    eldest = {"hash": "0", **sources("a", "b"), "spent_s": 1.0}
+    start = replace(small_weights, provenance=sources("b", "c", **{"from": eldest, "spent_s": 2.0}), hash="1")
+    made = provenance_of(sources("c", "d"), {}, start)
     assert [source["file"] for source in made["sources"]] == ["c", "d"]
     assert made["from"] == {
         "hash": "1",
-        **told("b"),
+        **sources("b"),
         "spent_s": 2.0,
-        "from": {"hash": "0", **told("a"), "spent_s": 1.0},
+        "from": {"hash": "0", **sources("a"), "spent_s": 1.0},
     }
-    assert start.provenance["sources"] == told("b", "c")["sources"], "which stay as they are"
+    assert start.provenance["sources"] == sources("b", "c")["sources"], "which stay as they are"
 
 
 def test_training_goes_on_only_from_weights_that_fit(tmp_path: Path, harmonic_frames: TrainingFrames,
@@ -119,7 +119,7 @@ def test_training_stops_on_nan_and_says_where(tmp_path: Path) -> None:
         return module(torch.full((1, 2), float("nan"))).sum(), {}
 
     with pytest.raises(SimulationError, match="not finite at step 0"):
-        run_stage(module, StageConfig("toy", 1, 1e-3, steps=3, bf16=False), loss_fn, dict,
+        run_stage(Stage(module, StageConfig("toy", 1, 1e-3, steps=3, bf16=False), loss_fn, dict),
                   StagePlace(tmp_path / "s", tmp_path / "l.csv", torch.device("cpu")))  # fmt: skip
     assert torch.isfinite(module.weight).all(), "the last good parameters are kept"
 

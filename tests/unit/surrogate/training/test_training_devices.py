@@ -1,10 +1,7 @@
-"""Where a training runs, on several processes too; curves, Muon, and the progress that is shown."""
+"""Where a training runs; curves, Muon, and the progress that is shown."""
 
 from __future__ import annotations
 
-import os
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
@@ -12,9 +9,10 @@ import torch
 from torch import Tensor, nn
 
 from surrogate.progress import progress_bar
-from surrogate.training.devices import choose_device, is_first_process
+from surrogate.training.devices import choose_device
 from surrogate.training.loop import (
     Muon,
+    Stage,
     StageConfig,
     StagePlace,
     append_row,
@@ -27,66 +25,9 @@ from surrogate.training.loop import (
 )
 from systems.errors import InputError, SimulationError
 
-LINE = """
-import sys
-from pathlib import Path
-import torch
-from torch import nn
-from surrogate.training.devices import open_fabric
-from surrogate.training.loop import StageConfig, StagePlace, run_stage
-
-folder = Path(sys.argv[1])
-fabric = open_fabric("cpu", False)
-torch.manual_seed(0)
-model = nn.Linear(3, 1)
-seen = []
-
-def loss(generator):
-    x = torch.randn(4, 3, generator=generator)
-    seen.append(x)
-    return (model(x) - x.sum(1, keepdim=True)).square().mean(), {}
-
-stage = StageConfig("line", 4, 1e-2, steps=30, warmup_steps=1, bf16=False, validate_every_s=1e9)
-run_stage(model, stage, loss, lambda: {},
-          StagePlace(folder / "s.train.safetensors", folder / "l.csv", torch.device("cpu")))
-torch.save({"x": torch.stack(seen), "weights": model.state_dict(), "world": fabric.world_size},
-           folder / f"rank{fabric.global_rank}.pt")
-"""
-
-
-@pytest.mark.slow
-def test_two_processes_train_one_model_on_twice_the_data(tmp_path: Path) -> None:
-    script = tmp_path / "line.py"
-    script.write_text(LINE)
-    root = str(Path(__file__).parents[4])
-    environment = {**os.environ, "PYTHONPATH": root, "OMP_NUM_THREADS": "1"}
-    command = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2", str(script)]
-    subprocess.run([*command, str(tmp_path)], env=environment, check=True, timeout=300, capture_output=True)
-    first, second = (torch.load(tmp_path / f"rank{k}.pt") for k in range(2))
-    assert first["world"] == 2
-    assert not torch.equal(first["x"], second["x"])
-    for name, tensor in first["weights"].items():
-        assert torch.equal(tensor, second["weights"][name]), name
-    assert len((tmp_path / "l.csv").read_text().splitlines()) == 2
-
-    # The same as one process on both batches together.
-    torch.manual_seed(0)
-    model = nn.Linear(3, 1)
-    batches = iter(torch.cat([first["x"], second["x"]], dim=1))
-
-    def loss(generator: torch.Generator) -> tuple[Tensor, dict[str, Tensor]]:
-        x = next(batches)
-        return (model(x) - x.sum(1, keepdim=True)).square().mean(), {}
-
-    one = tmp_path / "one"
-    one.mkdir()
-    run(one, model, loss, StageConfig("line", 8, 1e-2, steps=30, warmup_steps=1, bf16=False, validate_every_s=1e9))
-    for name, tensor in model.state_dict().items():
-        torch.testing.assert_close(tensor, first["weights"][name], rtol=1e-5, atol=1e-6)
-
 
 def run(folder: Path, model: nn.Module, loss, stage: StageConfig) -> None:
-    run_stage(model, stage, loss, dict,
+    run_stage(Stage(model, stage, loss, dict),
               StagePlace(folder / "s.train.safetensors", folder / "l.csv", torch.device("cpu")))  # fmt: skip
 
 
@@ -99,11 +40,6 @@ def test_devices_are_chosen(monkeypatch: pytest.MonkeyPatch) -> None:
         choose_device("tpu")
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     assert (choose_device("auto"), choose_device("cpu")) == ("cuda", "cpu")
-    monkeypatch.setenv("LOCAL_RANK", "3")
-    assert choose_device("auto") == "cuda:3"
-    assert is_first_process()
-    monkeypatch.setenv("RANK", "1")
-    assert not is_first_process()
 
 
 def test_training_that_diverges_says_where(tmp_path: Path) -> None:

@@ -11,7 +11,7 @@ import torch
 from safetensors import safe_open
 from safetensors.torch import save_file
 
-from surrogate.training.loop import StageConfig, StagePlace, run_stage, tensor_checksum
+from surrogate.training.loop import Stage, StageConfig, StagePlace, run_stage, tensor_checksum
 from systems.errors import InputError
 
 STAGE = StageConfig("toy", 4, 1e-2, steps=6, bf16=False, validate_every_s=0.0)
@@ -35,7 +35,7 @@ def train(folder: Path, *, resume: bool, stop_at: int | None = None, stage: Stag
         if stop_at is not None and share >= stop_at / 6:
             raise Stop
 
-    run_stage(module, stage, loss_fn, dict,
+    run_stage(Stage(module, stage, loss_fn, dict),
               StagePlace(folder / "s.train.safetensors", folder / "l.csv", torch.device("cpu"), resume),
               progress=progress)  # fmt: skip
     return module[0].weight.detach().clone()

@@ -189,9 +189,9 @@ def test_files_that_cannot_be_meant_are_refused_in_one_line(alanine: Path, tmp_p
 
 def test_a_record_comes_back_from_its_toml() -> None:
     record = {"arch": "a", "model": {"n": 3, "x": 1e-3, "on": True, "none": None, "text": 'q"\\', "list": [1.5, "b"],
-                                     "deep": {"kinds": [{"quad": [1, 2], "visited": None}], "empty": []}},
+                                     "deep": {"quad": [1, 2], "visited": None, "empty": []}},
               "training": {}}  # fmt: skip
     found = tomllib.loads(toml_text(record))
     expected = {"arch": "a", "model": {"n": 3, "x": 1e-3, "on": True, "text": 'q"\\', "list": [1.5, "b"],
-                                       "deep": {"kinds": [{"quad": [1, 2]}], "empty": []}}, "training": {}}  # fmt: skip
+                                       "deep": {"quad": [1, 2], "empty": []}}, "training": {}}  # fmt: skip
     assert found == expected

@@ -1,4 +1,4 @@
-"""Odds of entering phi > 0 after balancing: as many frames enter as leave."""
+"""Probabilities of entering phi > 0 after balancing: as many frames enter as leave."""
 
 from __future__ import annotations
 
@@ -55,9 +55,9 @@ def test_how_likely_the_rare_side_is_sets_the_probabilities() -> None:
     subject = _subject(frames, config)
     model = PeptideSlide(config).requires_grad_(False)
     (phi,) = weighted_phis(model, subject)
-    # Odds are the same from either side at first.
+    # Probabilities are the same from either side at first.
     assert lacking_entries(model, phi) == pytest.approx(np.log(SHARE / (1.0 - SHARE)), abs=1e-3)
-    assert [config.types[place - 2] for place in phi.places] == ["ALA", "ACE", "NME"]
+    assert [config.types[place - 2] for place in phi.chain.places[phi.residue].tolist()] == ["ALA", "ACE", "NME"]
 
 
 def test_before_a_proline_nothing_is_said() -> None:

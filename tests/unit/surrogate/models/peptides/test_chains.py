@@ -110,7 +110,7 @@ def test_residues_of_one_type_share_their_coordinates_wherever_they_stand() -> N
 
     def of(layout: ChainLayout, name: str) -> set[tuple[str, int]]:
         residue = layout.types.index(name)
-        return {(k, t) for k, r, t in zip(layout.keys, layout.residue_of, layout.kinds, strict=True) if r == residue}
+        return {(k, t) for k, r, t in zip(layout.keys, layout.residue_of, layout.motions, strict=True) if r == residue}
 
     first, second = layouts.values()
     for name in ("LEU", "SER", "NME", "ACE"):
@@ -142,7 +142,7 @@ def test_free_ends_are_the_same_in_all_residues_and_their_numbers_no_others(scen
 
 def test_torsions_are_told_by_cosine_and_sine_and_rings_are_not(scenes: dict[str, Scene]) -> None:
     layout = chain_layout(scenes["ACE-PRO-TRP-NME"])
-    turning = {key for key, kind in zip(layout.keys, layout.kinds, strict=True) if kind == TURNING}
+    turning = {key for key, motion in zip(layout.keys, layout.motions, strict=True) if motion == TURNING}
     assert "TRP dihedral C CA N C-1" in turning and "TRP dihedral N+1 C CA N" in turning
     assert "PRO dihedral CA N C-1 CA-1" in turning  # omega, cis or trans
     assert "PRO dihedral CG CD CB N" in turning  # the pucker, out of the plane of its neighbours
@@ -173,8 +173,8 @@ def test_what_a_reference_holds_rigid_is_a_constant() -> None:
             x[:, hydrogen] = x[:, heavy] + 0.1 * bond / np.linalg.norm(bond, axis=-1, keepdims=True)
     scale = chain_scale([(chain_layout(scene), x)])
     layout = resolved(chain_layout(scene), scale)
-    assert {RIGID, STIFF, TURNING} == set(layout.kinds)
-    rigid = [key for key, kind in zip(layout.keys, layout.kinds, strict=True) if kind == RIGID]
+    assert {RIGID, STIFF, TURNING} == set(layout.motions)
+    rigid = [key for key, motion in zip(layout.keys, layout.motions, strict=True) if motion == RIGID]
     assert len(rigid) == 12 and all(" length H" in key or " H" in key.split("length")[1] for key in rigid)
     code = ChainCode(layout, scale)
     assert torch.isfinite(code.encode(torch.from_numpy(x))).all()
@@ -197,14 +197,9 @@ def test_hydrogens_are_named_by_where_they_stand() -> None:
         i, j = at[residue, one], at[residue, other]
         names[i], names[j] = names[j], names[i]
     found, swapped = chain_layout(scene), chain_layout(replace(scene, atom_names=tuple(names)))
-    assert (found.keys, found.kinds, found.residue_of) == (swapped.keys, swapped.kinds, swapped.residue_of)
+    assert (found.keys, found.motions, found.residue_of) == (swapped.keys, swapped.motions, swapped.residue_of)
     x = torch.tensor(scene.positions_nm)[None].double()
-    values = [
-        internal_coordinates(
-            x, one.root, torch.tensor(one.placed), torch.tensor(one.closing), torch.tensor(one.primary)
-        )[0]
-        for one in (found, swapped)
-    ]
+    values = [internal_coordinates(x, one)[0] for one in (found, swapped)]
     apart = torch.abs(torch.atan2((values[0] - values[1]).sin(), (values[0] - values[1]).cos()))
     moved = [found.keys[k] for k in torch.nonzero(apart > 0.2)[:, 0].tolist()]
     assert moved == ["ALA dihedral HB1 CB CA N"]

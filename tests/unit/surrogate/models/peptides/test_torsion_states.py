@@ -1,5 +1,5 @@
-"""States of torsions: which they are, probabilities of changes learned by log-likelihood, and draws that follow
-them."""
+"""States of torsions: which they are, probabilities of changes learned by log-likelihood, draws that follow them, and
+frames set right by small turns: torsions mirrored at the end of their states, overlapping atoms turned apart."""
 
 from __future__ import annotations
 
@@ -10,6 +10,8 @@ import pytest
 import torch
 
 from small_scenes import with_phi_turned
+from surrogate.models.peptides import chains
+from surrogate.models.peptides import model as module
 from surrogate.models.peptides.chains import (
     MOST_TORSIONS,
     PHI,
@@ -17,9 +19,12 @@ from surrogate.models.peptides.chains import (
     RING,
     THREEFOLD,
     ChainFeatures,
+    StateBounds,
     StatedTorsions,
     conditioning_states,
+    dihedral,
     mended,
+    mirrored,
 )
 from surrogate.models.peptides.layout import PeptideConfig, chain_features, chain_layout, chain_scale
 from surrogate.models.peptides.model import PeptideSlide, StateJumps, times_apart
@@ -29,7 +34,7 @@ from systems.scene import Scene
 
 
 @pytest.mark.parametrize(
-    ("kind", "degrees", "states"),
+    ("bounds", "degrees", "states"),
     [
         # Strands that reach across 180 degrees are not left-handed.
         (PHI, [-170.0, -60.0, -1.0, 1.0, 60.0, 129.0, 131.0, 179.0], [0, 0, 0, 1, 1, 1, 0, 0]),
@@ -38,10 +43,8 @@ from systems.scene import Scene
         (RING, [-179.0, -1.0, 1.0, 179.0], [1, 1, 0, 0]),
     ],
 )
-def test_states_of_angles(
-    kind: tuple[float, tuple[float, float]], degrees: list[float], states: list[int]
-) -> None:  # fmt: skip
-    stated = StatedTorsions.of([([0, 1, 2, 3], 1, 2, kind)], 3)
+def test_states_of_angles(bounds: StateBounds, degrees: list[float], states: list[int]) -> None:
+    stated = StatedTorsions.of([([0, 1, 2, 3], 1, 2, bounds)], 3)
     found = stated.states(torch.tensor(degrees).deg2rad()[:, None])
     assert found.shape == (len(degrees), 3, MOST_TORSIONS)
     assert found[:, 1, 2].tolist() == states and found.sum() == sum(states)
@@ -59,7 +62,7 @@ def test_the_states_of_frames_are_those_of_their_torsions() -> None:
         [0, 0, 0, 0, 0, 0, 0], [0, 2, 0, 0, 0, 0, 0], [2, 2, 3, 3, 3, 3, 3], [2, 2, 3, 3, 0, 0, 0],
         [2, 2, 3, 2, 0, 0, 0], [0, 0, 0, 0, 0, 0, 0],
     ]  # fmt: skip
-    assert chain.signed.tolist() == [2, 3, 4]
+    assert chain.signed == [2, 3, 4]
     both = np.stack([scene.positions_nm, with_phi_turned(scene)])
     found = chain.states(torch.tensor(both))
     quads = [_quad(scene, residue, names) for residue, names in ((2, ("CA", "CB", "CG", "CD")), (3, _CHI1))]
@@ -110,7 +113,7 @@ def test_numbers_count_from_the_middle_of_the_state_and_come_back() -> None:
 
 
 def test_the_loss_is_the_negative_log_likelihood_of_what_was_done() -> None:
-    """Odds are set by hand: of two states and of three, one residue without any."""
+    """Probabilities are set by hand: of two states and of three, one residue without any."""
     jumps, counts = StateJumps(4, 2), _counts([2, 3], [])
     with torch.no_grad():
         jumps.logits.bias.zero_()
@@ -125,7 +128,7 @@ def test_the_loss_is_the_negative_log_likelihood_of_what_was_done() -> None:
     crosses = 1.0 / (1.0 + np.exp(-(1.0 + 0.5 * 2.0)))
     turns = np.exp(2.0) / (np.exp(-1.0) + np.exp(2.0) + 1.0)
     assert float(found) == pytest.approx((-np.log(crosses) - np.log(turns)) / 2.0, rel=1e-5)
-    # What the neighbours' types say comes on top, before and after told apart: this residue's are both of type 1.
+    # What the neighbours' types say comes on top, before and after: this residue's are both of type 1.
     with torch.no_grad():
         jumps.beside_change[1, 1, 0, 0, 1] = -0.2
         jumps.beside_change[:, 0] = 5.0
@@ -163,7 +166,7 @@ def test_the_second_torsion_sees_the_new_state_of_the_first_and_not_its_own() ->
     torch.nn.init.normal_(jumps.logits.weight)
     before = torch.zeros(1, 1, 1, MOST_TORSIONS, dtype=torch.long)
     places, time = torch.tensor([[0, 1, 1]]), torch.ones(1, 1)
-    common = jumps.of_known(torch.zeros(1, 1, 4), before[:, 0], places, counts)
+    common = jumps.of_observed(torch.zeros(1, 1, 4), before[:, 0], places, counts)
     of_times, levels = jumps.of_times_alone(time, time, places, counts)
     conditioning = conditioning_states(before, counts)
     h = jumps.of_frames(conditioning, conditioning) + common[:, None] + of_times[:, :, None]
@@ -204,7 +207,7 @@ def test_rates_of_two_residue_types_are_learned() -> None:
     up = states[:1, 0]
     for apart_ps in (1.0, 10.0):
         time = torch.tensor([[apart_ps]])
-        common = net.of_known(torch.zeros(1, 2, 6), up, places, counts)
+        common = net.of_observed(torch.zeros(1, 2, 6), up, places, counts)
         of_times, levels = net.of_times_alone(time, time, places, counts)
         conditioning = conditioning_states(up[:, None], counts)
         h = net.of_frames(conditioning, conditioning) + common[:, None] + of_times[:, :, None]
@@ -228,9 +231,6 @@ def test_a_chunk_is_drawn_again_where_it_disobeys_and_rows_do_not_depend_on_othe
     """With numbers that scatter widely about the middles of states, many frames disobey; with the probabilities of
     changes at nothing more of them stay in the given states after drawing again, or where torsions are mirrored at the
     end of their states, and a row alone is drawn as it is in a batch."""
-    from surrogate.models.peptides import chains as settling
-    from surrogate.models.peptides import model as module
-
     scene = build_peptide("ACE-ALA-NME")
     torch.manual_seed(0)
     model = PeptideSlide(_config(scene)).eval().requires_grad_(False)
@@ -245,10 +245,10 @@ def test_a_chunk_is_drawn_again_where_it_disobeys_and_rows_do_not_depend_on_othe
     model.token_scale[chain.places[1, 0]] = 0.75
     model.token_mean.copy_(_middles(model, chain))
     shares = []
-    for most, mirrored in ((0, 0.0), (module.MAX_REDRAWS, 0.0), (0, settling._MIRRORED_DEG)):
+    for most, mirrored_deg in ((0, 0.0), (module.MAX_REDRAWS, 0.0), (0, chains._MIRRORED_DEG)):
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(module, "MAX_REDRAWS", most)
-            patch.setattr(settling, "_MIRRORED_DEG", mirrored)
+            patch.setattr(chains, "_MIRRORED_DEG", mirrored_deg)
             frames = model.next_chunk(last, molecule, noise, solver_steps=2).frames_nm
         obeys = (chain.states(frames) == own).flatten(1).all(dim=1)
         shares.append(float(obeys.float().mean()))
@@ -260,8 +260,6 @@ def test_a_chunk_is_drawn_again_where_it_disobeys_and_rows_do_not_depend_on_othe
 @pytest.mark.parametrize("again", [False, True])
 def test_states_in_which_atoms_always_overlap_are_drawn_again(monkeypatch: pytest.MonkeyPatch, again: bool) -> None:
     """Psi changes as often as not, and its other state is said to have no room."""
-    from surrogate.models.peptides import model as module
-
     if not again:
         monkeypatch.setattr(module, "_OVERLAPS", module.MAX_REDRAWS)
     scene = build_peptide("ACE-ALA-NME")
@@ -299,8 +297,6 @@ def test_atoms_overlap_where_they_are_nearer_than_md_lets_them_and_no_few_bonds_
 
 def test_a_chunk_whose_atoms_overlap_is_drawn_again_in_the_same_states(monkeypatch: pytest.MonkeyPatch) -> None:
     """Of what is drawn a frame of the first of three rows overlaps twice: that row alone is drawn three times."""
-    from surrogate.models.peptides import model as module
-
     scene = build_peptide("ACE-ALA-NME")
     model = PeptideSlide(_config(scene)).eval().requires_grad_(False)
     model.lag_ps = 1.0
@@ -323,3 +319,90 @@ def test_a_chunk_whose_atoms_overlap_is_drawn_again_in_the_same_states(monkeypat
     chunk = model.next_chunk(last, molecule, noise, solver_steps=2)
     assert seen == [3, 1, 1]
     assert chunk.evaluations == pytest.approx(2 * (3 + 1 + 1) / 3)
+
+
+Crowded = tuple[ChainFeatures, torch.Tensor, torch.Tensor]
+
+
+@pytest.mark.parametrize(
+    ("bounds", "state", "drawn", "expected"),
+    [
+        (PHI, 0, [-60.0, 5.0, 29.0, -5.0, 125.0, 131.0], [-60.0, -5.05, -29.05, -5.0, 135.05, 131.0]),
+        (PHI, 1, [60.0, -5.0, 140.0, -29.0], [60.0, 5.05, 119.95, 29.05]),
+        (PSI, 0, [80.0, 70.0, -121.0, -110.0], [80.0, 80.05, -121.0, -130.05]),
+        (THREEFOLD, 2, [-60.0, 10.0, -130.0], [-60.0, -10.05, -109.95]),
+        (RING, 1, [-90.0, 20.0, 170.0], [-90.0, -20.05, -169.95]),
+    ],
+)
+def test_a_torsion_a_little_beyond_its_state_is_mirrored(
+    bounds: StateBounds, state: int, drawn: list[float], expected: list[float]
+) -> None:
+    stated = StatedTorsions.of([([0, 1, 2, 3], 0, 1, bounds)], 1)
+    states = torch.zeros(len(drawn), 1, MOST_TORSIONS, dtype=torch.long)
+    states[:, 0, 1] = state
+    found, far = mirrored(torch.tensor(drawn).deg2rad()[:, None], states, stated)
+    turned = (found[:, 0].rad2deg() - torch.tensor(expected) + 180.0) % 360.0 - 180.0
+    torch.testing.assert_close(turned, torch.zeros(len(drawn)), rtol=0, atol=1e-3)
+    assert not far.any()
+    assert (stated.states(found)[:, 0, 1] == state).all()
+
+
+def test_a_torsion_far_beyond_its_state_is_left_to_be_drawn_again() -> None:
+    stated = StatedTorsions.of([([0, 1, 2, 3], 0, 0, PHI)], 1)
+    angles = torch.tensor([31.0, 90.0]).deg2rad()[:, None]
+    found, far = mirrored(angles, torch.zeros(2, 1, MOST_TORSIONS, dtype=torch.long), stated)
+    assert far.tolist() == [[True], [True]] and torch.equal(found, angles)
+
+
+@pytest.fixture(scope="module")
+def crowded() -> Crowded:
+    """Lysine and glutamate with torsions at random, of which a good part overlap; each in the states that it is in."""
+    scene = build_peptide("ACE-LYS-GLU-NME")
+    chain = chain_features(scene, _config(scene))
+    tokens = chain.code.encode(torch.tensor(scene.positions_nm).float()).expand(200, -1, -1).clone()
+    at, flat = chain.code.turning_at, tokens.flatten(-2)
+    angles = torch.atan2(flat[:, at + 1], flat[:, at])
+    angles = angles + 0.9 * torch.randn(angles.shape, generator=torch.Generator().manual_seed(0))
+    tokens = chains._with_torsions(tokens, at, angles)
+    return chain, tokens, chain.states(chain.code.decode(tokens))
+
+
+def test_overlapping_atoms_are_turned_apart_and_nothing_else_is(
+    crowded: Crowded,
+) -> None:
+    chain, tokens, states = crowded
+    before = chain.code.decode(tokens)
+    overlap = chain.overlap(before)
+    assert 0.2 < overlap.float().mean() < 0.9
+    with torch.inference_mode():  # as in rollouts
+        frames, astray, still = mended(tokens, states, chain)
+    torch.testing.assert_close(frames[~overlap], before[~overlap], rtol=0, atol=1e-6)
+    assert torch.equal(still, chain.overlap(frames)) and still.sum() < 0.15 * overlap.sum()
+    right = ~astray & ~still
+    assert (chain.states(frames[right]) == states[right]).all()
+    turned = _turned_deg(chain, before[overlap & right], frames[overlap & right])
+    assert turned.max(1).values.median() < 25.0
+    # Bonds, angles and handedness are what they were.
+    conditioning = [chain.code.encode(x[overlap]) for x in (before, frames)]
+    stiff = chain.code.filled_stiff.flatten()
+    torch.testing.assert_close(
+        conditioning[0].flatten(-2)[:, stiff], conditioning[1].flatten(-2)[:, stiff], rtol=0, atol=2e-3
+    )
+    # Each frame by itself.
+    one = int(torch.nonzero(overlap)[3])
+    torch.testing.assert_close(mended(tokens[one : one + 1], states[one : one + 1], chain)[0][0], frames[one],
+                               rtol=0, atol=1e-5)  # fmt: skip
+
+
+def test_without_turns_they_stay_where_they_are(crowded: Crowded, monkeypatch: pytest.MonkeyPatch) -> None:
+    chain, tokens, states = crowded
+    monkeypatch.setattr(chains, "_TURNS", 0)
+    frames, astray, still = mended(tokens, states, chain)
+    assert torch.equal(still, chain.overlap(chain.code.decode(tokens))) and not astray.any()
+    torch.testing.assert_close(frames, chain.code.decode(tokens), rtol=0, atol=1e-6)
+
+
+def _turned_deg(chain: ChainFeatures, before: torch.Tensor, after: torch.Tensor) -> torch.Tensor:
+    quads = torch.tensor(chain.code.layout.turning)
+    angles = [dihedral(*(x[..., quads[:, k], :] for k in range(4))) for x in (before, after)]
+    return ((angles[1] - angles[0]).rad2deg() + 180.0).remainder(360.0).sub(180.0).abs()
