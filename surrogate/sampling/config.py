@@ -57,7 +57,7 @@ class RolloutConfig:
         "Length of MD at 600 K that replicas start from after cooling (learned potentials).", 0.0, within=(0.0, None)
     )
     solver: str | None = option(
-        "ODE solver: multistep, fitted (few steps), gaussian, angular (peptides), euler.",
+        "ODE solver: multistep, fitted (few steps), gaussian, angular (peptides), euler, dopri5.",
         None,
         unset="chosen by the weights",
         section="sampling",

@@ -29,7 +29,8 @@ def rollout(
     of it (`save_every_ps`), each marked with its chunk and validity. Weights that were trained for several lags step at
     `lag_ps`, by default at the longest that `save_every_ps` is a multiple of; weights of several peptides take others
     of the same residues. Replicas run in one batch, are named as by `reference` and joined as there. `solver`:
-    'multistep', 'fitted' (for few `solver_steps`, 2 to 10) or 'euler', None for the one that suits the weights.
+    'multistep', 'fitted' (for few `solver_steps`, 2 to 10), 'euler' or the adaptive 'dopri5', None for the
+    one that suits the weights.
     `precision`: 'fp32', 'bf16' or 'auto'. `compile`: the networks, by torch; it takes a C++ compiler and about a
     minute, and pays in long rollouts.
 

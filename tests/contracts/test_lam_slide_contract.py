@@ -7,10 +7,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from torch import Tensor
 
-from surrogate.models.conformance import PropagatorContract
+from surrogate.models.conformance import PropagatorContract, branched_chain, random_state
 from surrogate.models.lam_slide.model import ApproximatorConfig, AutoencoderConfig, LamSlide, LamSlideConfig
-from surrogate.models.propagator import Propagator
+from surrogate.models.propagator import Chunk, Molecule, Propagator
 from surrogate.models.weights import Weights, load_weights, save_weights
 from surrogate.sampling.runner import RolloutConfig, rollout
 from systems.errors import InputError
@@ -57,6 +58,30 @@ class TestLamSlideOneLatent(PropagatorContract):
 class TestLamSlideCleanConditioning(PropagatorContract):
     def make(self, n_atoms: int) -> Propagator:
         return small_model(3, n_conditioning=3, clean=True)
+
+
+class TestLamSlideAdaptive(PropagatorContract):
+    """With dopri5: rows do not depend on each other's steps."""
+
+    # Steps are chosen anew in bf16: held to the error of the whole chain, not of one evaluation.
+    bf16_error = 0.1
+    sizes = (1, 2)
+
+    def make(self, n_atoms: int) -> Propagator:
+        return small_model(3)
+
+    def call(self, model: Propagator, frames: Tensor, molecule: Molecule, noise: Tensor, velocities: Tensor) -> Chunk:
+        with torch.no_grad():
+            return model.next_chunk(frames, molecule, noise, solver_steps=1, solver="dopri5")
+
+
+def test_adaptive_evaluations_are_counted() -> None:
+    model = small_model(3)
+    frames, molecule = random_state(5, 2, 1)[0], branched_chain(5)
+    noise = torch.randn(2, *model.noise_shape(5), generator=torch.Generator().manual_seed(0))
+    counts = [model.next_chunk(frames, molecule, noise, solver=s, solver_steps=9).evaluations for s in model.solvers]
+    assert counts[:-1] == [9.0] * (len(model.solvers) - 1)
+    assert (counts[-1] or 0.0) > 9.0
 
 
 def test_older_weights_name_their_interpolant() -> None:

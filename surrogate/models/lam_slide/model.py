@@ -326,7 +326,7 @@ class LamSlide(Propagator):
 
     arch: ClassVar[str] = "lam-slide"
     float32_layers: tuple[str, ...] = ("autoencoder.to_position",)
-    solvers: tuple[str, ...] = ("multistep", "fitted", "euler")
+    solvers: tuple[str, ...] = ("multistep", "fitted", "euler", "dopri5")
     config: LamSlideConfig
 
     def __init__(self, config: LamSlideConfig) -> None:
@@ -382,6 +382,11 @@ class LamSlide(Propagator):
     def next_chunk(self, last_frames_nm: Tensor, molecule: Molecule, noise: Tensor, *, solver_steps: int = 10,
                    solver: str | None = None, last_velocities_nm_ps: Tensor | None = None) -> Chunk:  # fmt: skip
         """See `Propagator.next_chunk`. Velocities play no part."""
+        if solver in flow.ADAPTIVE and len(noise) > 1:
+            pairs = zip(last_frames_nm.split(1), noise.split(1), strict=True)
+            rows = [self.next_chunk(x, molecule, n, solver_steps=solver_steps, solver=solver) for x, n in pairs]
+            mean = sum(row.evaluations or 0.0 for row in rows) / len(rows)
+            return Chunk(torch.cat([row.frames_nm for row in rows]), evaluations=mean)
         # Frames that training turned at random, it had about their middle.
         middle_nm = 0.0 if self.config.canonical else last_frames_nm[:, -1:].mean(-2, keepdim=True)
         known = self.encode(last_frames_nm - middle_nm, molecule.elements)

@@ -186,3 +186,28 @@ def test_fitted_is_of_second_order(width: float) -> None:
     errors = [abs(relative_width("fitted", width, n) - 1) for n in (40, 80, 160)]
     assert all(0.15 < fine / coarse < 0.42 for coarse, fine in pairwise(errors)), errors
     assert errors[-1] < 0.01
+
+
+def test_adaptive_steps_carry_noise_to_the_data_distribution() -> None:
+    """Linear in the noise: the ratio of the widths is exact but for the tolerance."""
+    noise = torch.randn(100, 1, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    exact = gaussian_posterior(0.2)
+    calls = 0
+
+    def predict(o: Tensor, tau: Tensor) -> Tensor:
+        nonlocal calls
+        calls += 1
+        return exact(o, tau)
+
+    def error(sample: Tensor) -> float:
+        return abs(float(sample.std() / noise.std()) / 0.2 - 1.0)
+
+    errors, counts = [], []
+    for n_steps in (20, 2000):
+        calls = 0
+        errors.append(error(flow.dopri5(predict, noise, n_steps)))
+        counts.append(calls)
+    assert errors[0] < 0.01 and errors[1] < 1e-4, errors
+    assert 10 < counts[0] < counts[1] < 300, counts
+    # Negative control: as many even Euler steps as the finer took are further off.
+    assert error(flow.euler(exact, noise, counts[1])) > 10 * errors[1]
