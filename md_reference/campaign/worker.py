@@ -23,7 +23,7 @@ from md_reference.forces.forcefield import build_system, resolve
 from md_reference.forces.solvation import require_molecules, solvate
 from md_reference.forces.spec import ForceFieldSpec, WaterBox
 from md_reference.run.config import MDConfig
-from md_reference.run.machine import PlatformChoice, measured_platform
+from md_reference.run.machine import PlatformChoice, platform_for
 from md_reference.run.simulate import simulate
 from md_reference.run.starts import many_starts
 from systems.chemistry.graph import molecule_key
@@ -102,9 +102,9 @@ def _prepare(path: Path, spec: SceneSpec, config: MDConfig, seed: int, replicas:
         require_molecules(force)
     if force.is_explicit and scene.cell_nm is None:
         scene = solvate(scene, force, _chosen(WaterBox, spec), seed=seed, temperature_k=config.temperature_k)
-    system = build_system(scene, force)
-    choice = measured_platform(scene, replace(config, force=force), system=lambda: system)
-    prepared = PreparedScene(replace(scene, name=spec.name), force, replace(choice, timings=()), seed=seed)
+    build_system(scene, force)
+    choice = platform_for(scene, replace(config, force=force))
+    prepared = PreparedScene(replace(scene, name=spec.name), force, choice, seed=seed)
     if replicas > 1 and config.starts == "many":
         starts = many_starts(prepared.scene, replace(config, force=force, seed=seed), replicas)
         frames = tuple(s.positions_nm.tolist() for s in starts.scenes)
@@ -130,8 +130,10 @@ def _chosen(kind: type[T], spec: SceneSpec) -> T:
 def load_prepared(path: Path) -> PreparedScene:
     """Read what `prepare_scene` wrote. Raises InputError when it cannot be read."""
     try:
-        return built(PreparedScene, parsed(content(path)))
-    except (OSError, ValueError) as error:
+        record = parsed(content(path))
+        record["platform"].pop("timings", None)  # of an earlier version
+        return built(PreparedScene, record)
+    except (OSError, ValueError, LookupError, TypeError, AttributeError) as error:
         raise InputError(f"{path} cannot be read ({error}); delete it to have the scene prepared again.") from error
 
 

@@ -41,9 +41,7 @@ class Conditions:
     ensemble: str = option("Ensemble: nvt, nve or npt.", "nvt")
     pressure_bar: float = option("Barostat pressure (npt).", 1.0)
     seed: int = 0
-    platform: str = option(
-        "OpenMM platform; auto: the fastest, timed here; simd: 16 replicas at once on one core.", "auto"
-    )
+    platform: str = option("OpenMM platform; auto: by size; simd: 16 replicas at once on one core.", "auto")
 
 
 @dataclass(frozen=True, kw_only=True)

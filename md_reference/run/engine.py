@@ -16,7 +16,7 @@ from md_reference.forces.mixture import solute_of
 from md_reference.forces.quantum import refuse_rearranged
 from md_reference.forces.spec import QUANTUM
 from md_reference.run.config import Conditions
-from md_reference.run.machine import choose_platform, make_context
+from md_reference.run.machine import choose_platform, make_context, platform_for
 from systems.chemistry.element_data import covalent_radius_nm
 from systems.chemistry.geometry import signed_volumes
 from systems.chemistry.graph import stereocentres
@@ -119,7 +119,7 @@ class Engine:
         self.ensemble = conditions.ensemble
         self.scene = scene
         self.spec = conditions.force
-        choice = choose_platform(scene.n_atoms, conditions.platform, born=self.spec.solvent != "vacuum")
+        choice = platform_for(scene, conditions)
         self.platform_name, self.threads = choice.name, threads or choice.threads
         self._system = build_system(scene, self.spec) if system is None else system
         # OpenMM reads a seed of 0 as "choose one from the clock".

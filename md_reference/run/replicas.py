@@ -24,7 +24,7 @@ import numpy.typing as npt
 from md_reference.forces.forcefield import build_system
 from md_reference.run.config import SIMD, MDConfig, check_run
 from md_reference.run.engine import Engine, refuse_damaged
-from md_reference.run.machine import available_cores, measured_platform, simd_choice
+from md_reference.run.machine import available_cores, platform_for, simd_choice
 from md_reference.run.plan import plan_line
 from md_reference.run.simulate import ProgressFn, StoredRun, already_complete, record_of, report_preparing, simulate
 from md_reference.run.starts import many_starts
@@ -203,7 +203,7 @@ def simulate_replicas(
     `scene`: what they start from, each from a state of its own unless `config.starts` is one (`starts.many_starts`); or
     a start for each replica. Each replica is a process with its share of the cores, one thread where there are as many
     replicas as cores: on small scenes the fastest use of them. On platform simd up to sixteen replicas share a process.
-    The platform is measured once, for all, and `announce` gets the plan in one line, and the error of a replica that
+    `announce` gets the plan in one line, and the error of a replica that
     fails while others run, which it may raise to end them too; `progress` counts the frames of all replicas. Ctrl-C and
     SIGTERM stop them all with checkpoints: KeyboardInterrupt. When this process is killed outright they stop by
     themselves. Raises InputError for a script that starts them outside `if __name__ == '__main__':`, SimulationError
@@ -224,7 +224,7 @@ def simulate_replicas(
     if fresh:
         if config.platform != SIMD:
             each = max(1, available_cores() // width)
-            choice = measured_platform(scene, config, max_threads=each, side_by_side=width)
+            choice = platform_for(scene, config, max_threads=each)
         if announce is not None:
             announce(plan_line(scene, config, choice or simd_choice(), replicas=len(outs)))
     scenes = [scene] * len(outs) if given is None else given

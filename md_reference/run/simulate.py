@@ -15,7 +15,7 @@ import numpy as np
 from md_reference.forces.forcefield import build_system
 from md_reference.run.config import MDConfig, check_run, check_same_run, settings_of
 from md_reference.run.engine import Engine, State, integrator_name, refuse_damaged
-from md_reference.run.machine import PlatformChoice, measured_platform
+from md_reference.run.machine import PlatformChoice, platform_for
 from md_reference.run.run_summary import summarise
 from systems.errors import InputError, SimulationError
 from systems.files.schema import built
@@ -77,9 +77,8 @@ def simulate(
     those of this run. The equilibration is kept in the same way. Ctrl-C and SIGTERM stop at once with a checkpoint,
     inside a frame if need be: KeyboardInterrupt. No other process can write `out` meanwhile.
 
-    With `platform='auto'` the platform is measured (`platforms.measured_platform`, one thread), unless `choice` says
-    what has been. Raises SimulationError when coordinates stop being finite or the system blows up
-    (`Engine.state`): the frames before stay in the file, which then says `completed: false`.
+    `choice`: the platform where it has been chosen before. Raises SimulationError when coordinates stop being finite or
+    the system blows up (`Engine.state`): the frames before stay in the file, which then says `completed: false`.
     """
     out = Path(out)
     config = check_run(scene, config, out)
@@ -203,7 +202,7 @@ class _Run(StoredRun):
         self.system = build_system(self.scene, self.config.force)
         if self.resumed:
             choice = PlatformChoice(self.stand.platform, self.stand.threads, "as before it was resumed")
-        self.choice = choice or measured_platform(self.scene, self.config, system=lambda: self.system)
+        self.choice = choice or platform_for(self.scene, self.config)
 
     def engine(self, ensemble: str) -> Engine:
         conditions = replace(self.config, ensemble=ensemble, platform=self.choice.name)
