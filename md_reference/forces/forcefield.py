@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from md_reference.forces.gaff import load_openmm, parameters
+from md_reference.forces import gaff
 from md_reference.forces.mixture import is_water, merge, molecules_of
 from md_reference.forces.nonstandard import build_chain, find_chain
 from md_reference.forces.quantum import build_quantum_system
@@ -161,8 +161,7 @@ def _build_mixed(scene: Scene, spec: ForceFieldSpec) -> Any:
                 f"{spec.protein} has no parameters for {', '.join(chain.lacking[:4])} of scene {scene.name!r}; such "
                 "residues are joined to ff14SB alone: use `force_field='ff14SB+gaff2'`."
             )
-        build = _build_molecule if chain is None else build_chain
-        parts.append((atoms, build(part, spec)))
+        parts.append((atoms, build_chain(part, spec) if chain is not None else _build_molecule(part, spec)))
     system = merge(scene.n_atoms, parts)
     if spec.is_explicit:
         nonbonded = next(f for f in system.getForces() if isinstance(f, NonbondedForce))
@@ -183,6 +182,4 @@ def _build_molecule(scene: Scene, spec: ForceFieldSpec) -> Any:
     """Return the System of one GAFF2 molecule in vacuum."""
     from openmm import app
 
-    return load_openmm(parameters(scene)).createSystem(
-        nonbondedMethod=app.NoCutoff, rigidWater=False, **spec.openmm_settings()
-    )
+    return gaff.entry(scene).system(scene, nonbondedMethod=app.NoCutoff, rigidWater=False, **spec.openmm_settings())

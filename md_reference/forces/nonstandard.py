@@ -222,9 +222,8 @@ def make_template(capped: CappedResidue, name: str) -> tuple[str, float]:
     from openmm import app
 
     scene = capped.scene
-    system = gaff.load_openmm(gaff.parameters(scene)).createSystem(
-        nonbondedMethod=app.NoCutoff, constraints=None, rigidWater=False, removeCMMotion=False
-    )
+    vacuum = {"nonbondedMethod": app.NoCutoff, "constraints": None, "rigidWater": False, "removeCMMotion": False}
+    system = gaff.entry(scene).system(scene, **vacuum)
     backbone = backbone_types(capped)
     types = [t or (f"{name}-{k}" if k < capped.n_own else None) for k, t in enumerate(backbone)]
     terms, particles = _terms(system)
