@@ -23,7 +23,7 @@ from typing import Any, Literal, TypeVar, Union, cast, get_args, get_origin, get
 
 from systems.errors import InputError, UnknownNameError, nearest
 from systems.files.outside import content
-from systems.units import format_quantity, is_openmm_quantity, openmm_number, parser_of, quantity, stem_of, unit_of
+from systems.units import format_quantity, parser_of, quantity, stem_of, unit_of
 
 T = TypeVar("T")
 _KEY = "option"
@@ -150,9 +150,6 @@ class Option(Declaration):
     def value(self, given: Any, what: str) -> Any:
         """Return what is given for it, checked and in our unit. Raises UnitError, UnknownNameError or InputError, which
         call it `what`."""
-        if is_openmm_quantity(given):
-            given = openmm_number(self.name if self.unit else "", given, what)
-            given = given.tolist() if self.many and hasattr(given, "tolist") else given
         if hasattr(given, "item") and not getattr(given, "ndim", 1):
             given = given.item()
         if self.reader is not None and (given is not None or type(None) not in get_args(self.hint)):
@@ -167,6 +164,11 @@ class Option(Declaration):
                 raise InputError(f"{error}.") from None
         self.check(value, what)
         return value
+
+    def written(self, given: Any, what: str) -> Any:
+        """Return what a file gives for it; there a quantity carries its unit."""
+        bare = self.unit and isinstance(given, int | float) and not isinstance(given, bool)
+        return self.value(str(given) if bare else given, what)
 
     def _read(self, given: Any, what: str) -> Any:
         if given is None or given == self.default:
@@ -267,8 +269,7 @@ def read_options(kind: type, file: str | Path) -> dict[str, Any]:
             name = keys.get(key.replace("-", "_"))
             if name is None:
                 raise InputError(f"{where}unknown key {key!r}.{_meant(key, section, known)}")
-            bare = known[name].unit and isinstance(value, int | float) and not isinstance(value, bool)
-            values[name] = known[name].value(str(value) if bare else value, f"{where}{key}")
+            values[name] = known[name].written(value, f"{where}{key}")
     return values
 
 

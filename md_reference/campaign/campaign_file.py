@@ -5,11 +5,11 @@ from __future__ import annotations
 import re
 import tomllib
 from collections.abc import Iterable
-from dataclasses import MISSING, Field, dataclass, field, fields, replace
+from dataclasses import dataclass, field, fields, replace
 from glob import glob
 from hashlib import sha256
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeVar, cast, get_args, get_type_hints
+from typing import Annotated, Any, Literal, TypeVar, cast
 
 from md_reference.campaign.manifest import file_sha256
 from md_reference.forces.spec import ForceFieldSpec, WaterBox
@@ -19,7 +19,7 @@ from systems.files.outside import content
 from systems.files.schema import built, fitted, parsed
 from systems.library.named_scenes import find_protocol
 from systems.options import Preparation, options_of
-from systems.units import parse_wall_s, parser_of, quantity
+from systems.units import parse_wall_s, quantity
 
 T = TypeVar("T")
 SCENE_FILES = (".pdb", ".ent", ".cif", ".mmcif", ".gz", ".sdf", ".mol", ".mol2")
@@ -27,10 +27,6 @@ SCENE_FILES = (".pdb", ".ent", ".cif", ".mmcif", ".gz", ".sdf", ".mol", ".mol2")
 JOB_LOGS = "jobs"
 _LONGEST_NAME, _MOST_RUNS = 40, 100_000
 _SEEDS = 2**31
-# Settings whose names end so are written without it, as texts with a unit.
-_ENDINGS = ("_per_ps", "_ps", "_k", "_da")
-# These belong to a run's place in the campaign.
-_NOT_SETTINGS = ("seed", "force")
 
 
 @dataclass(frozen=True)
@@ -92,7 +88,7 @@ class Campaign:
 
 @dataclass(frozen=True)
 class Settings:
-    """What one table says: fields of MDConfig and ForceFieldSpec by name, switches of `prepare`, and the axes."""
+    """What one table says: fields of MDConfig and ForceFieldSpec by name, options of `prepare`, and the axes."""
 
     values: dict[str, Any]
     preparation: dict[str, Any]
@@ -144,8 +140,9 @@ def read_campaign(path: str | Path, *, folder: str | Path | None = None) -> Camp
 
 # What a table says of its runs beside their settings.
 _AXES = {"replicas": Annotated[int, range(1, _MOST_RUNS + 1)], "temperatures": tuple[float | str, ...], "protocol": str}
-# How a scene is made: a campaign takes what the command line takes.
+# How a scene is made, and how a run goes, by their keys in a file: what the command line takes.
 _PREPARATION = options_of(Preparation) | options_of(WaterBox)
+SETTINGS = {each.key: each for kind in (MDConfig, ForceFieldSpec) for each in options_of(kind).values()}
 
 
 def _campaign(table: dict[str, Any], path: Path, text: str, folder: Path | None) -> Campaign:
@@ -188,47 +185,21 @@ def _read(kind: type[T], table: dict[str, Any], where: str) -> tuple[T, Settings
     return built(kind, {key: value for key, value in table.items() if key in own}, where), settings
 
 
-def _known_fields() -> dict[str, Field[Any]]:
-    return {f.name: f for kind in (MDConfig, ForceFieldSpec) for f in fields(kind) if f.name not in _NOT_SETTINGS}
-
-
-def key_of(name: str) -> str:
-    """Return the key in a file of a field: `timestep` of `timestep_ps`."""
-    return next((name.removesuffix(ending) for ending in _ENDINGS if name.endswith(ending)), name)
-
-
 def read_settings(table: dict[str, Any], *, others: Iterable[str] = (), where: str = "") -> Settings:
     """Return a table's settings, in our units. Raises InputError for a key that is unknown (with the nearest that is
-    known; `others` are keys the caller has read), ValueError for values of the wrong kind."""
-    hints = get_type_hints(MDConfig) | get_type_hints(ForceFieldSpec)
-    by_key = {key_of(name): name for name in _known_fields()}
+    known; `others` are keys the caller has read), and InputError or ValueError for values of the wrong kind."""
     found = Settings({}, {}, {})
     for key, value in table.items():
         if key in _AXES:
             found.axes[key] = fitted(value, _AXES[key], f"{where}{key}")
         elif key in _PREPARATION:
             found.preparation[key] = _PREPARATION[key].value(value, f"{where}{key}")
-        elif key in by_key:
-            name = by_key[key]
-            found.values[name] = _value(name, hints[name], value, f"{where}{key}")
+        elif key in SETTINGS:
+            found.values[SETTINGS[key].name] = SETTINGS[key].written(value, f"{where}{key}")
         else:
-            meant = nearest(key, [*by_key, *_PREPARATION, *_AXES, *others])
+            meant = nearest(key, [*SETTINGS, *_PREPARATION, *_AXES, *others])
             raise InputError(f"{where}unknown key {key!r}.{meant}")
     return found
-
-
-def _value(name: str, hint: Any, value: Any, where: str) -> Any:
-    if type(None) in get_args(hint) and value in ("natural", "none"):
-        return None
-    if name.endswith(_ENDINGS):
-        return parser_of(name)(str(fitted(value, float | str, where)), where)
-    return fitted(value, hint, where)
-
-
-def default_of(name: str) -> Any:
-    """Return the default of a setting, or None where it has none."""
-    known = _known_fields().get(name)
-    return None if known is None or known.default is MISSING else known.default
 
 
 def _scene_tables(head: _Head, base: Path) -> list[dict[str, Any]]:

@@ -18,7 +18,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from md_reference.campaign.campaign_file import JOB_LOGS, Campaign, Run, SceneSpec, default_of, first_seed, key_of
+from md_reference.campaign.campaign_file import JOB_LOGS, Campaign, Run, SceneSpec, first_seed
 from md_reference.campaign.cluster import poll, result_of, stop
 from md_reference.campaign.manifest import (
     COMPLETE,
@@ -32,7 +32,7 @@ from md_reference.campaign.manifest import (
     read_manifest,
     write_manifest,
 )
-from md_reference.run.config import settings_of
+from md_reference.run.config import MDConfig, settings_of
 from systems.errors import InputError, TrajectoryError
 from systems.files.whole_file import OutputLock
 from systems.interrupts import deferred_interrupt
@@ -97,21 +97,19 @@ def check_same_campaign(old: Manifest, new: Manifest, folder: Path) -> Manifest:
     for name, scene in old.scenes.items():
         same("scenes", name, name if name in scenes else "without it")
         asked = scenes[name]
-        if not scene.source_sha256 or scene.source_sha256 != asked.source_sha256:  # else the same file, moved
-            same(f"source of scene {name}", scene.source, asked.source)
-        same(f"source sha256 of scene {name}", scene.source_sha256, asked.source_sha256)
-        same(f"preparation of scene {name}", scene.preparation, asked.preparation)
+        is_moved = scene.source_sha256 and scene.source_sha256 == asked.source_sha256
+        for key in ("source_sha256", "preparation") if is_moved else ("source", "source_sha256", "preparation"):
+            same(f"{key} of scene {name}", getattr(scene, key), getattr(asked, key))
         scenes[name] = replace(scene, status=WAITING, reason="") if scene.status == FAILED else scene
+    # A setting that an older version did not know counts as its default.
+    defaults = settings_of(MDConfig(time_ps=0.0))
     for name, run in old.runs.items():
         if name not in runs:
-            is_replica = any((r.scene, r.temperature_k) == (run.scene, run.temperature_k) for r in new.runs.values())
-            axis = "replicas" if is_replica else "temperatures"
-            same(f"{axis} of scene {run.scene}", f"with {name}", "without it")
-        same("format", Path(run.file).suffix[1:], Path(runs[name].file).suffix[1:])
+            same(f"runs of scene {run.scene}", f"with {name}", "without it")
         same(f"file of {name}", run.file, runs[name].file)
         for key in {**run.settings, **runs[name].settings}:
-            was, now = (given.get(key, default_of(key)) for given in (run.settings, runs[name].settings))
-            same(f"{key_of(key)} of scene {run.scene} ({key})", was, now)
+            was, now = (given.get(key, defaults.get(key)) for given in (run.settings, runs[name].settings))
+            same(f"{key} of scene {run.scene}", was, now)
         file = folder / run.file
         if run.status != COMPLETE or not file.is_file() or file.stat().st_size != run.size_bytes:
             # What is gone is made anew, and need not come out the same on another machine; what is there must be what
@@ -335,16 +333,10 @@ def _work(token: str, folder: Path, name: str, *given: Any) -> dict[str, Any]:
 @contextmanager
 def _only_process(folder: Path) -> Iterator[None]:
     """Hold the campaign's lock. Raises InputError when another process runs the campaign."""
-    existed = folder.exists()
     folder.mkdir(parents=True, exist_ok=True)
     try:
         lock = OutputLock(folder / MANIFEST_NAME)
     except TrajectoryError:
         raise InputError(f"{folder}: another process runs this campaign; wait for it, or stop it first.") from None
-    try:
-        with lock:
-            yield
-    finally:
-        if not existed and not (folder / MANIFEST_NAME).exists():
-            with suppress(OSError):
-                folder.rmdir()
+    with lock:
+        yield

@@ -68,7 +68,7 @@ class ForceFieldSpec:
     hydrogen_mass_da: float | None = option(
         "Mass of hydrogens after repartitioning, or 'natural'.", 3.0, read=parse_hydrogen_mass_da
     )
-    constrain_hydrogens: bool = True
+    constrain_hydrogens: bool = option("Keep bonds to hydrogen rigid.", True, words=None)
 
     def __post_init__(self) -> None:
         for what, name, known in (

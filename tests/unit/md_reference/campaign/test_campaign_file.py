@@ -10,7 +10,6 @@ import pytest
 
 from md_reference.campaign.campaign_file import Campaign, first_seed, read_campaign
 from md_reference.forces.spec import ForceFieldSpec
-from md_reference.run.config import settings_of
 from md_reference.run.simulate import MDConfig
 from systems.errors import InputError
 
@@ -95,19 +94,6 @@ def test_runs_are_scenes_times_temperatures_times_replicas(tmp_path: Path, repos
     assert campaign.scenes[1].source == str(tmp_path / "pdb" / "a.pdb")
     assert len(campaign.scenes[1].source_sha256) == 64
     assert campaign.folder == tmp_path / "c"
-
-
-def test_every_setting_of_a_run_has_a_key(tmp_path: Path) -> None:
-    (run,) = _read(tmp_path, SMALL).runs
-    settings = {key: value for key, value in settings_of(run.config).items() if key != "seed"}
-    values = {bool: "true", int: "1", float: "1.0", str: "'x'", type(None): "1.0"}
-    for name, value in settings.items():
-        key = next((name.removesuffix(e) for e in ("_per_ps", "_ps", "_k", "_da") if name.endswith(e)), name)
-        text = SMALL if key == "time" else SMALL + f"{key} = {values[type(value)]}\n"
-        try:
-            _read(tmp_path, text)
-        except InputError as error:
-            assert "unknown key" not in str(error), error
 
 
 def test_seeds_depend_on_what_a_run_is_alone(tmp_path: Path) -> None:
