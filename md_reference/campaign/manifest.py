@@ -150,14 +150,10 @@ def campaign_trajectories(path: Path, *, verify: bool = False) -> tuple[list[Pat
         raise InputError(f"{path}: none of the {len(entries)} runs of this campaign here is complete.")
     for name, expected in [item for run in complete for item in run.sha256.items()] if verify else ():
         file = folder / name
-        if not file.is_file():
+        if not file.is_file() or file_sha256(file) != expected:
             raise TrajectoryError(
-                f"{file} is gone, though {MANIFEST_NAME} lists it; run the campaign again to remake it."
-            )
-        if file_sha256(file) != expected:
-            raise TrajectoryError(
-                f"{file} is not the file that the campaign wrote (its sha256 differs from {MANIFEST_NAME}); delete it "
-                "and run the campaign again to remake it."
+                f"{file} is gone, or not the file that the campaign wrote (its sha256 differs from {MANIFEST_NAME}); "
+                "delete it and run the campaign again to remake it."
             )
     return [folder / run.file for run in complete], len(entries) - len(complete)
 

@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from md_reference.campaign.campaign_file import JOB_LOGS, Campaign, Run, SceneSpec, first_seed
-from md_reference.campaign.cluster import poll, result_of, stop
+from md_reference.campaign.cluster import guarded, poll, result_of, stop
 from md_reference.campaign.manifest import (
     COMPLETE,
     FAILED,
@@ -275,7 +275,7 @@ class _Job:
             priority = 1 << 62
         else:
             expected = self.manifest.runs[task.name].frames_sha256
-            own = ("simulate_run", task, self._campaign.checkpoint_every_s, expected)
+            own = ("simulate_run", self._token, task, self._campaign.checkpoint_every_s, expected)
             n_steps = task.config.n_frames * task.config.steps_per_frame
             priority = (self.manifest.scenes[task.scene].n_atoms or 1) * n_steps
         future = self._client.submit(_work, self._token, self._folder, *own, key=key, priority=priority)
@@ -313,9 +313,8 @@ class _Job:
             if entries["status"] == COMPLETE:
                 self._submit(run)
             else:
-                self._note(
-                    self.manifest.runs, run.name, status=FAILED, reason=f"scene {task.name}: {entries['reason']}"
-                )
+                reason = f"scene {task.name}: {entries['reason']}"
+                self._note(self.manifest.runs, run.name, status=FAILED, reason=reason)
 
     def _note(self, table: dict[str, Any], name: str, **entries: Any) -> None:
         table[name] = replace(table[name], **entries)
@@ -324,10 +323,14 @@ class _Job:
 
 def _work(token: str, folder: Path, name: str, *given: Any) -> dict[str, Any]:
     """Do a task of `md_reference.campaign.worker`, which imports OpenMM: only workers do."""
-    from md_reference.campaign import worker
 
-    result: dict[str, Any] = getattr(worker, name)(token, folder, *given)
-    return result
+    def work() -> dict[str, Any]:
+        from md_reference.campaign import worker
+
+        result: dict[str, Any] = getattr(worker, name)(folder, *given)
+        return result
+
+    return guarded(token, folder / MANIFEST_NAME, work)
 
 
 @contextmanager

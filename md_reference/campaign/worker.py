@@ -17,7 +17,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from md_reference.campaign.campaign_file import Run, SceneSpec
-from md_reference.campaign.cluster import LEASE_S, guarded, session_of
+from md_reference.campaign.cluster import LEASE_S, session_of
 from md_reference.campaign.manifest import MANIFEST_NAME, file_sha256, frames_sha256
 from md_reference.forces.forcefield import build_system, resolve
 from md_reference.forces.solvation import require_molecules, solvate
@@ -80,17 +80,11 @@ def scene_path(folder: Path, name: str) -> Path:
     return folder / "scenes" / f"{name}.json"
 
 
-def prepare_scene(
-    token: str, folder: Path, spec: SceneSpec, config: MDConfig, seed: int, replicas: int = 1
-) -> dict[str, Any]:
+def prepare_scene(folder: Path, spec: SceneSpec, config: MDConfig, seed: int, replicas: int = 1) -> dict[str, Any]:
     """Prepare a scene, or take the one that lies in `scenes/NAME.json`, and return its summary. `config`: of any of its
     runs, which share all but temperature and seed; `seed`: of the water around it; `replicas`: how many begin apart."""
     path = scene_path(folder, spec.name)
-
-    def prepared() -> PreparedScene:
-        return load_prepared(path) if path.is_file() else _prepare(path, spec, config, seed, replicas)
-
-    return guarded(token, folder / MANIFEST_NAME, lambda: prepared().summary())
+    return (load_prepared(path) if path.is_file() else _prepare(path, spec, config, seed, replicas)).summary()
 
 
 def _prepare(path: Path, spec: SceneSpec, config: MDConfig, seed: int, replicas: int) -> PreparedScene:
@@ -137,13 +131,9 @@ def load_prepared(path: Path) -> PreparedScene:
         raise InputError(f"{path} cannot be read ({error}); delete it to have the scene prepared again.") from error
 
 
-def simulate_run(token: str, folder: Path, run: Run, checkpoint_every_s: float, expected: str) -> dict[str, Any]:
+def simulate_run(folder: Path, token: str, run: Run, checkpoint_every_s: float, expected: str) -> dict[str, Any]:
     """Simulate a run, or go on with it, and return what the manifest says of it when it is complete. `expected`: the
     hash of its frames, where the manifest already has one."""
-    return guarded(token, folder / MANIFEST_NAME, lambda: _simulate(token, folder, run, checkpoint_every_s, expected))
-
-
-def _simulate(token: str, folder: Path, run: Run, checkpoint_every_s: float, expected: str) -> dict[str, Any]:
     session = session_of(token)
     # Read when OpenMM creates its first Context: one thread per replica.
     os.environ["OPENMM_CPU_THREADS"] = "1"
