@@ -23,8 +23,6 @@ from systems.units import parse_wall_s, quantity
 
 T = TypeVar("T")
 SCENE_FILES = (".pdb", ".ent", ".cif", ".mmcif", ".gz", ".sdf", ".mol", ".mol2")
-# Folder of the batch system's logs, inside the campaign's.
-JOB_LOGS = "jobs"
 _LONGEST_NAME, _MOST_RUNS = 40, 100_000
 _SEEDS = 2**31
 
@@ -51,27 +49,6 @@ class Run:
 
 
 @dataclass(frozen=True)
-class ClusterSpec:
-    """What is asked of a batch system, through dask-jobqueue: `jobs` jobs at most, each with `cores` runs at a time.
-
-    `interface`: the network interface on which scheduler and workers talk. Of the kinds, which are those that
-    dask-jobqueue knows, `local` starts the same jobs as processes here, to try a file out.
-    """
-
-    kind: Literal["slurm", "pbs", "sge", "lsf", "htcondor", "moab", "oar", "local"]
-    jobs: Annotated[int, range(1, 10_000)] = 1
-    cores: Annotated[int, range(1, 10_000)] = 1
-    memory: str = "2GB"
-    walltime: str = ""
-    queue: str = ""
-    account: str = ""
-    interface: str = ""
-    python: str = ""
-    directives: tuple[str, ...] = ()
-    prologue: tuple[str, ...] = ()
-
-
-@dataclass(frozen=True)
 class Campaign:
     """Everything a campaign's file says, with every run spelled out."""
 
@@ -82,7 +59,6 @@ class Campaign:
     runs: tuple[Run, ...]
     retries: int = 2
     checkpoint_every_s: float = 20.0
-    cluster: ClusterSpec | None = None
     text: str = field(default="", compare=False)
 
 
@@ -106,7 +82,6 @@ class _Head:
     seed: Annotated[int, range(2**63)] = 0
     retries: Annotated[int, range(1000)] = 2
     checkpoint_every: str = "20s"
-    cluster: ClusterSpec | None = None
 
 
 @dataclass(frozen=True)
@@ -173,7 +148,6 @@ def _campaign(table: dict[str, Any], path: Path, text: str, folder: Path | None)
         runs=tuple(runs),
         retries=head.retries,
         checkpoint_every_s=parse_wall_s(head.checkpoint_every, "checkpoint_every"),
-        cluster=head.cluster,
         text=text,
     )
 

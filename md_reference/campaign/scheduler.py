@@ -18,7 +18,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from md_reference.campaign.campaign_file import JOB_LOGS, Campaign, Run, SceneSpec, first_seed
+from md_reference.campaign.campaign_file import Campaign, Run, SceneSpec, first_seed
 from md_reference.campaign.cluster import guarded, poll, result_of, stop
 from md_reference.campaign.manifest import (
     COMPLETE,
@@ -132,7 +132,7 @@ def open_campaign(campaign: Campaign) -> Manifest:
         manifest = check_same_campaign(read_manifest(folder), manifest, folder)
     elif folder.is_file():
         raise InputError(f"{folder} is a file; name another folder (out = ..., or `out`).")
-    elif folder.is_dir() and any(not path.name.startswith(".") and path.name != JOB_LOGS for path in folder.iterdir()):
+    elif folder.is_dir() and any(not path.name.startswith(".") for path in folder.iterdir()):
         raise InputError(f"{folder} is not empty and no campaign's folder; name another (out = ..., or `out`).")
     try:
         folder.mkdir(parents=True, exist_ok=True)

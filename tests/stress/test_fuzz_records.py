@@ -53,7 +53,6 @@ CAMPAIGN = {
     "temperatures": ["300K", 350], "time": "10ps", "save_every": "1ps", "timestep": "2fs", "platform": "Reference",
     "solvent": "vacuum", "hydrogen_mass": "natural", "constrain_hydrogens": True, "ph": 7, "padding_nm": 1.0,
     "scenes": [{"scene": "alanine-dipeptide", "name": "a", "replicas": 1, "keep_water": False}, "ethanol"],
-    "cluster": {"kind": "slurm", "jobs": 2, "memory": "2GB", "directives": ["-x"]},
 }  # fmt: skip
 
 

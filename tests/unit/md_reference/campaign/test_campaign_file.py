@@ -127,9 +127,6 @@ def test_names_of_scenes_serve_as_files(tmp_path: Path) -> None:
         (SMALL + "seeds = 3", "unknown key 'seeds'. Did you mean 'seed'?"),
         (SMALL + "solvnt = 'vacuum'", "Did you mean 'solvent'?"),
         ("time='10ps'\n[[scenes]]\nscene='alanine-dipeptide'\nreplica=3", "Did you mean 'replicas'?"),
-        (SMALL + "[cluster]\nkind='slurm'\nwaltime='1h'", "Did you mean 'walltime'?"),
-        (SMALL + "[cluster]\nqueue='x'", "cluster.kind is missing"),
-        (SMALL + "[cluster]\nkind='slurm'\njobs=0", "cluster.jobs = 0 must be a whole number"),
         ("scenes = ['alanine-dipeptid']\ntime='10ps'", "Did you mean 'alanine-dipeptide'?"),
         ("scenes = ['none.pdb']\ntime='10ps'", "no such file"),
         ("scenes = ['*.pdb']\ntime='10ps'", "no file matches"),
@@ -208,5 +205,3 @@ def test_the_file_in_the_manual_is_one(tmp_path: Path, repository: Path) -> None
     campaign = _read(tmp_path, "".join(blocks))
     assert [scene.name for scene in campaign.scenes] == ["alanine-dipeptide", "ACE-GLY-NME", "a", "ethanol"]
     assert len(campaign.runs) == 4 * 2 * 4
-    assert campaign.cluster is not None
-    assert (campaign.cluster.kind, campaign.cluster.cores) == ("slurm", 8)
