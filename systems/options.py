@@ -13,8 +13,8 @@ import inspect
 import textwrap
 import tomllib
 import types
-from collections.abc import Callable, Hashable, Mapping, Sequence
-from dataclasses import MISSING, dataclass, field, fields, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import MISSING, dataclass, field, fields
 from functools import cache
 from inspect import get_annotations
 from operator import attrgetter
@@ -38,19 +38,6 @@ class MissingOptionError(InputError):
         self.needs = f"needs {name}: {option.help}"
 
 
-@dataclass(frozen=True)
-class Declaration:
-    """What a field's metadata says of an option; see `option`."""
-
-    help: str
-    choices: tuple[str, ...]
-    within: tuple[float | None, float | None]
-    read: Callable[[str, str], Any] | None
-    unset: str
-    words: tuple[str, ...] | None
-    section: str
-
-
 def option(
     help: str,
     default: Any = MISSING,
@@ -71,8 +58,8 @@ def option(
     stands in, which keeps it off the command line, too.
     """
     words = None if words is None or section else tuple(words)
-    said = Declaration(help, tuple(choices), within, read, unset, words, section)
-    return field(default=default, metadata={_KEY: said})
+    said = {"help": help, "choices": tuple(choices), "within": within, "read": read, "unset": unset, "words": words}
+    return field(default=default, metadata={_KEY: {**said, "section": section}})
 
 
 def from_field(kind: type, name: str, default: Any = ..., *, unset: str = "") -> Any:
@@ -80,17 +67,24 @@ def from_field(kind: type, name: str, default: Any = ..., *, unset: str = "") ->
 
     With another `default`, None say, what the option comes to is what it is there, or `unset`.
     """
-    found: Declaration = cast(Any, kind).__dataclass_fields__[name].metadata[_KEY]
-    shown = options_of(kind)[name]
+    said, shown = cast(Any, kind).__dataclass_fields__[name].metadata[_KEY], options_of(kind)[name]
     if default is ...:
-        return field(default=shown.default, metadata={_KEY: found})
-    return field(default=default, metadata={_KEY: replace(found, unset=unset or shown.shown_default)})
+        return field(default=shown.default, metadata={_KEY: said})
+    return field(default=default, metadata={_KEY: {**said, "unset": unset or shown.shown_default}})
 
 
 @dataclass(frozen=True, kw_only=True)
-class Option(Declaration):
-    """An option of a dataclass: its declaration, and the field's name, type and default (MISSING: it must be given)."""
+class Option:
+    """An option of a dataclass: what `option` declares, and the field's name, type and default (MISSING: it must be
+    given)."""
 
+    help: str
+    choices: tuple[str, ...]
+    within: tuple[float | None, float | None]
+    read: Callable[[str, str], Any] | None
+    unset: str
+    words: tuple[str, ...] | None
+    section: str
     name: str
     hint: Any
     default: Any
@@ -204,19 +198,14 @@ def _listed(names: Sequence[str]) -> str:
     return " or ".join([", ".join(names[:-1]), names[-1]] if len(names) > 1 else names)
 
 
-def options_of(kind: type) -> dict[str, Option]:
-    """Return the options of a dataclass by name: its own, then those of its bases, each in the order they stand in."""
-    return _options_of(kind)
-
-
 @cache
-def _options_of(kind: Hashable) -> dict[str, Option]:
-    made = cast(Any, kind)
-    hints = get_type_hints(made)
-    declared = {f.name: f for f in fields(made) if _KEY in f.metadata}
-    order = dict.fromkeys(name for each in made.__mro__ for name in get_annotations(each) if name in declared)
+def options_of(kind: Any) -> dict[str, Option]:
+    """Return the options of a dataclass by name: its own, then those of its bases, each in the order they stand in."""
+    hints = get_type_hints(kind)
+    declared = {f.name: f for f in fields(kind) if _KEY in f.metadata}
+    order = dict.fromkeys(name for each in kind.__mro__ for name in get_annotations(each) if name in declared)
     return {
-        name: Option(**vars(declared[name].metadata[_KEY]), name=name, hint=hints[name], default=declared[name].default)
+        name: Option(**declared[name].metadata[_KEY], name=name, hint=hints[name], default=declared[name].default)
         for name in order
     }
 
@@ -306,9 +295,9 @@ def read_toml(path: str | Path) -> dict[str, Any]:
 
         return dict(parsed(content(Path(path)).decode(), tomllib.loads))
     except FileNotFoundError:
-        raise InputError(f"configuration {path} does not exist.") from None
+        raise InputError(f"{path} does not exist.") from None
     except (OSError, ValueError) as error:
-        raise InputError(f"configuration {path} is not valid TOML: {error}.") from error
+        raise InputError(f"{path} is not valid TOML: {error}.") from error
 
 
 # ---- functions that take options ------------------------------------------------------------------------------------

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import re
-import tomllib
 from collections.abc import Iterable
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, fields, replace
 from glob import glob
 from hashlib import sha256
 from pathlib import Path
@@ -15,10 +14,9 @@ from md_reference.campaign.manifest import file_sha256
 from md_reference.forces.spec import ForceFieldSpec, WaterBox
 from md_reference.run.config import MDConfig, resolve_by_name, to_config
 from systems.errors import InputError, SurromdError, nearest
-from systems.files.outside import content
-from systems.files.schema import built, fitted, parsed
+from systems.files.schema import built, fitted
 from systems.library.named_scenes import find_protocol
-from systems.options import Preparation, options_of
+from systems.options import Preparation, options_of, read_toml
 from systems.units import parse_wall_s, quantity
 
 T = TypeVar("T")
@@ -53,13 +51,13 @@ class Campaign:
     """Everything a campaign's file says, with every run spelled out."""
 
     name: str
+    file: Path
     folder: Path
     seed: int
     scenes: tuple[SceneSpec, ...]
     runs: tuple[Run, ...]
     retries: int = 2
     checkpoint_every_s: float = 20.0
-    text: str = field(default="", compare=False)
 
 
 @dataclass(frozen=True)
@@ -99,15 +97,9 @@ def read_campaign(path: str | Path, *, folder: str | Path | None = None) -> Camp
     values of the wrong kind, scenes named twice, and settings that no run can have.
     """
     path = Path(path)
+    table = read_toml(path)
     try:
-        text = content(path).decode()
-        table = parsed(text, tomllib.loads)
-    except FileNotFoundError:
-        raise InputError(f"{path}: no such file.") from None
-    except (OSError, ValueError) as error:
-        raise InputError(f"{path} cannot be read as TOML: {error}.") from error
-    try:
-        return _campaign(table, path, text, None if folder is None else Path(folder))
+        return _campaign(table, path, None if folder is None else Path(folder))
     except (ValueError, InputError) as error:
         said = f"{error}." if isinstance(error, ValueError) else str(error)
         raise InputError(said if str(path) in said else f"{path}: {said}") from error
@@ -120,7 +112,7 @@ _PREPARATION = options_of(Preparation) | options_of(WaterBox)
 SETTINGS = {each.key: each for kind in (MDConfig, ForceFieldSpec) for each in options_of(kind).values()}
 
 
-def _campaign(table: dict[str, Any], path: Path, text: str, folder: Path | None) -> Campaign:
+def _campaign(table: dict[str, Any], path: Path, folder: Path | None) -> Campaign:
     if not table.get("scenes"):
         raise InputError("name the scenes: scenes = ['alanine-dipeptide', ...], or a [[scenes]] table for each.")
     head, shared = _read(_Head, table, "")
@@ -148,7 +140,7 @@ def _campaign(table: dict[str, Any], path: Path, text: str, folder: Path | None)
         runs=tuple(runs),
         retries=head.retries,
         checkpoint_every_s=parse_wall_s(head.checkpoint_every, "checkpoint_every"),
-        text=text,
+        file=path,
     )
 
 

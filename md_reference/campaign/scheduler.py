@@ -136,7 +136,7 @@ def open_campaign(campaign: Campaign) -> Manifest:
         raise InputError(f"{folder} is not empty and no campaign's folder; name another (out = ..., or `out`).")
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        (folder / "campaign.toml").write_text(campaign.text, encoding="utf-8")
+        (folder / "campaign.toml").write_bytes(campaign.file.read_bytes())
     except OSError as error:
         raise InputError(f"{folder} cannot be made or written: {error.strerror}.") from error
     write_manifest(folder, manifest)

@@ -10,13 +10,12 @@ from __future__ import annotations
 import math
 import multiprocessing
 import os
-import queue
 import time
 from collections.abc import Callable, Sequence
-from contextlib import ExitStack
-from dataclasses import dataclass, replace
+from contextlib import ExitStack, suppress
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -178,15 +177,6 @@ class _Batch(StoredRun):
 _UNGUARDED = 79
 
 
-@dataclass(frozen=True)
-class _Board:
-    """What processes write and their parent reads: frames done, shares equilibrated (both by process), last words."""
-
-    done: Any
-    equilibrated: Any
-    errors: Any
-
-
 def simulate_replicas(
     scene: Scene | Sequence[Scene],
     config: MDConfig,
@@ -244,31 +234,39 @@ def simulate_replicas(
         _run(*job(0), progress)
         return list(outs)
     context = multiprocessing.get_context("spawn")
-    # Without a lock, which a killed process would never give back: each number has one writer.
-    board = _Board(context.Array("Q", len(jobs), lock=False), context.Array("d", len(jobs), lock=False),
-                   context.Queue())  # fmt: skip
     waiting = list(range(len(jobs)))
-    running: dict[int, Any] = {}
-    failures: dict[int, str] = {}
-    reasons: dict[int, str] = {}
+    running: dict[int, tuple[Any, Any]] = {}
+    # Of each job, by its process: frames done, share equilibrated, the reason why it failed.
+    said: list[dict[str, Any]] = [{} for _ in jobs]
+
+    def error() -> SimulationError | None:
+        failed = [k for k, words in enumerate(said) if "failed" in words]
+        if not failed:
+            return None
+        reason = f"replica {jobs[failed[0]][0]}: {said[failed[0]]['failed']}"
+        return SimulationError(f"{sum(len(jobs[k]) for k in failed)} of {len(outs)} replicas failed; {reason}")
+
     with deferred_interrupt() as asked_to_stop:
         try:
             while waiting or running:
                 while waiting and len(running) < width:
                     k = waiting.pop(0)
-                    process = context.Process(target=_replicas, args=(*job(k), board, k), name=f"replica-{jobs[k][0]}")
+                    pipe, end = context.Pipe(duplex=False)
+                    process = context.Process(target=_replicas, args=(*job(k), end), name=f"replica-{jobs[k][0]}")
                     process.start()
-                    running[k] = process
+                    end.close()
+                    running[k] = process, pipe
                 time.sleep(0.1)
                 if asked_to_stop():
                     raise KeyboardInterrupt
-                n_done = int(sum(board.done[:]))
-                if n_done == 0:
-                    report_preparing(progress, sum(board.equilibrated[:]) / len(jobs))
-                elif progress is not None:
-                    progress(n_done, config.n_frames * len(outs))
-                for k in [k for k, process in running.items() if not process.is_alive()]:
-                    process = running.pop(k)
+                for k, (process, pipe) in list(running.items()):
+                    is_over = not process.is_alive()
+                    with suppress(EOFError, OSError):
+                        while pipe.poll():
+                            said[k].update([pipe.recv()])
+                    if not is_over:
+                        continue
+                    del running[k]
                     process.join()
                     if process.exitcode == _UNGUARDED:
                         raise InputError(
@@ -276,34 +274,22 @@ def simulate_replicas(
                             "them below `if __name__ == '__main__':`."
                         )
                     if process.exitcode != 0:
-                        _collect(board.errors, reasons, k)
-                        failures[k] = reasons.get(k, f"exit code {process.exitcode}")
+                        said[k].setdefault("failed", f"exit code {process.exitcode}")
                         if announce is not None and (waiting or running):
-                            announce(_error(failures, jobs))
+                            announce(cast(SimulationError, error()))
+                n_done = sum(words.get("done", 0) for words in said)
+                if n_done == 0:
+                    report_preparing(progress, sum(words.get("equilibrated", 0.0) for words in said) / len(jobs))
+                elif progress is not None:
+                    progress(n_done, config.n_frames * len(outs))
         finally:
-            for process in running.values():
+            for process, _ in running.values():
                 process.terminate()
-            for process in running.values():
+            for process, _ in running.values():
                 process.join()
-    if failures:
-        raise _error(failures, jobs)
+    if failure := error():
+        raise failure
     return list(outs)
-
-
-def _error(failures: dict[int, str], jobs: Sequence[range]) -> SimulationError:
-    k = min(failures)
-    failed, of_all = sum(len(jobs[i]) for i in failures), sum(map(len, jobs))
-    return SimulationError(f"{failed} of {of_all} replicas failed; replica {jobs[k][0]}: {failures[k]}")
-
-
-def _collect(errors: Any, reasons: dict[int, str], wanted: int) -> None:
-    """Read what replicas said when they failed, until `wanted` is among them; a killed one says nothing."""
-    try:
-        while wanted not in reasons:
-            k, reason = errors.get(timeout=1)
-            reasons[k] = reason
-    except queue.Empty:
-        pass
 
 
 def _run(
@@ -318,23 +304,19 @@ def _run(
         simulate(scenes[0], config, outs[0], progress=progress, **how)
 
 
-def _replicas(
-    scenes: Sequence[Scene], config: MDConfig, outs: Sequence[Path], how: dict[str, Any], board: _Board, k: int
-) -> None:
-    """Run the k-th job in a process of its own."""
+def _replicas(scenes: Sequence[Scene], config: MDConfig, outs: Sequence[Path], how: dict[str, Any], pipe: Any) -> None:
+    """Run a job in a process of its own, which says into `pipe` how far it is, or why it failed."""
     end_with_parent()
     os.environ["OPENMM_CPU_THREADS"] = "1"
 
     def report(done: int, total: int, note: str | None = None) -> None:
-        if note is None:
-            board.done[k] = done
-        else:
-            board.equilibrated[k] = done / total
+        with suppress(OSError):  # the parent is gone, and this process ends, too
+            pipe.send(("done", done) if note is None else ("equilibrated", done / total))
 
     try:
         _run(scenes, config, outs, how, report)
     except SurromdError as error:
-        board.errors.put((k, str(error)))
+        pipe.send(("failed", str(error)))
         raise SystemExit(1) from None
     except KeyboardInterrupt:
         raise SystemExit(130) from None

@@ -109,7 +109,7 @@ def test_one_trains_on_a_campaign_s_folder(finished: Path, tmp_path: Path) -> No
     ("text", "said"),
     [
         (LONG + "temprature = '1K'", "unknown key 'temprature'. Did you mean 'temperature'?"),
-        ("scenes = [", "cannot be read as TOML"),
+        ("scenes = [", "is not valid TOML"),
     ],
 )
 def test_a_file_that_cannot_be_meant_is_one_line(tmp_path: Path, text: str, said: str) -> None:
