@@ -1,9 +1,8 @@
-"""Options of the verbs, each declared once: a field of a frozen dataclass whose metadata says what it does.
+"""Options of the verbs, each declared once: a field of a frozen dataclass whose metadata says what it does. From it
+follow the command line, the Python call (`options_as_keywords`), the keys of a `config` file and the manual's tables.
 
-From that declaration follow the command line, the signature and the documentation of the Python call
-(`options_as_keywords`), the keys of a `config` file, their checks, and the manual's tables. A name ends in its unit
-(`time_ps`), which the command line and files leave out: there a value carries it (`time = "10ns"`). Imports no library,
-so that the command's help is quick.
+A name ends in its unit (`time_ps`), which the command line and files leave out: there a value carries it (`time =
+"10ns"`). Imports no library, so that the command's help is quick.
 """
 
 from __future__ import annotations
@@ -49,13 +48,13 @@ def option(
     words: Sequence[str] | None = (),
     section: str = "",
 ) -> Any:
-    """Return a dataclass field that is an option.
+    """Return a dataclass field that is an option; without a `default` it must be given.
 
-    `help`: one sentence. Without a `default` it must be given. `choices`: the values that there are; `within`: bounds
-    of a number. `read(text, what)` returns the value of a text where the unit in the name does not say how. `unset`:
-    what the default comes to, for the help. `words`: how the command line calls it, where that is not its name without
-    the unit, and a letter for it; None keeps it off the command line. `section`: the table of a `config` file that it
-    stands in, which keeps it off the command line, too.
+    `help`: one sentence. `choices`: the values that there are; `within`: bounds of a number. `read(text, what)` returns
+    the value of a text where the unit in the name does not say how. `unset`: what the default comes to, for the help.
+    `words`: how the command line calls it, where that is not its name without the unit, and a letter for it; None keeps
+    it off the command line. `section`: the table of a `config` file that it stands in, which keeps it off the command
+    line, too.
     """
     words = None if words is None or section else tuple(words)
     said = {"help": help, "choices": tuple(choices), "within": within, "read": read, "unset": unset, "words": words}
@@ -75,8 +74,7 @@ def from_field(kind: type, name: str, default: Any = ..., *, unset: str = "") ->
 
 @dataclass(frozen=True, kw_only=True)
 class Option:
-    """An option of a dataclass: what `option` declares, and the field's name, type and default (MISSING: it must be
-    given)."""
+    """An option of a dataclass: what `option` declares, and the field's name, type and default (MISSING: none)."""
 
     help: str
     choices: tuple[str, ...]
@@ -277,11 +275,7 @@ def part_of(settings: Any, kind: type[T]) -> T:
 
 
 def flag_of(name: str) -> str:
-    """Return how the command line calls an option of this name, where nothing else is declared.
-
-    >>> flag_of("save_every_ps") == "-" * 2 + "save-every"
-    True
-    """
+    """Return how the command line calls an option of this name, where nothing else is declared."""
     return f"--{stem_of(name).replace('_', '-')}"
 
 
@@ -307,12 +301,11 @@ R = TypeVar("R")
 
 
 def options_as_keywords(kind: type) -> Callable[[Callable[..., R]], Callable[..., R]]:
-    """Let a function whose last parameter is `options`, a dataclass `kind`, be called with these options as keywords.
+    """Let a function whose last parameter is `options`, a dataclass `kind`, be called with these options as keywords,
+    which its signature lists and its documentation explains.
 
-    Its signature lists them one by one, as an editor or `help` shows it, and its documentation says what each does.
-    `options=` takes the dataclass itself, `config=` the path of a TOML file; keywords come before both. A quantity is a
-    number in the unit that its name ends in, or a text with its own. Any other keyword is a TypeError, as always, which
-    names the nearest.
+    `options=` takes the dataclass itself, `config=` the path of a TOML file; keywords come before both. Any other
+    keyword is a TypeError, as always, which names the nearest.
     """
     known = options_of(kind)
 

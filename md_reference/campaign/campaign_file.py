@@ -12,7 +12,7 @@ from typing import Annotated, Any, Literal, TypeVar, cast
 
 from md_reference.campaign.manifest import file_sha256
 from md_reference.forces.spec import ForceFieldSpec, WaterBox
-from md_reference.run.config import MDConfig, resolve_by_name, to_config
+from md_reference.run.config import MDConfig, resolve_settings, to_config
 from systems.errors import InputError, SurromdError, nearest
 from systems.files.schema import built, fitted
 from systems.library.named_scenes import find_protocol
@@ -152,8 +152,8 @@ def _read(kind: type[T], table: dict[str, Any], where: str) -> tuple[T, Settings
 
 
 def read_settings(table: dict[str, Any], *, others: Iterable[str] = (), where: str = "") -> Settings:
-    """Return a table's settings, in our units. Raises InputError for a key that is unknown (with the nearest that is
-    known; `others` are keys the caller has read), and InputError or ValueError for values of the wrong kind."""
+    """Return a table's settings, in our units. Raises InputError for a key that is unknown (with the nearest; `others`
+    are keys the caller has read), and InputError or ValueError for values of the wrong kind."""
     found = Settings({}, {}, {})
     for key, value in table.items():
         if key in _AXES:
@@ -229,7 +229,7 @@ def _runs_of(spec: SceneSpec, shared: Settings, own: Settings, head: _Head) -> l
     shared, protocol = _by_protocol(shared, own)
     # Nobody trains on the water of a hundred runs.
     given = {"keep": "solute", **shared.values, **own.values}
-    values, _ = resolve_by_name("" if _kind(spec.source) else spec.source, given, protocol)
+    values, _ = resolve_settings("" if _kind(spec.source) else spec.source, given, protocol)
     axes = {**shared.axes, **own.axes}
     # A single temperature of the scene's own outweighs the campaign's list.
     if "temperature_k" in own.values and "temperatures" not in own.axes:

@@ -49,8 +49,8 @@ class SceneEntry:
 class RunEntry:
     """One replica of one scene at one temperature; paths are relative to the campaign's folder.
 
-    `sha256` holds the hash of each file the run wrote; `frames_sha256` hashes what was simulated, without dates and
-    costs: it is the same for the same run on another day. `settings` are those the run was asked for, in our units.
+    `sha256`: of each file the run wrote; `frames_sha256`: of what was simulated, the same for the same run on another
+    day. `settings` are those the run was asked for, in our units.
     """
 
     name: str

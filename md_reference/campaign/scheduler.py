@@ -1,8 +1,5 @@
-"""A campaign: many scenes, temperatures and replicas on Dask workers; whatever dies, what is left goes on.
-
-Every run is one task, and its state is its files: a task that starts again, on whichever worker, goes on from the run's
-checkpoint. `manifest.json` says what is done; it is written by this process alone.
-"""
+"""A campaign: many scenes, temperatures and replicas on Dask workers; whatever dies, what is left goes on from the
+files. `manifest.json`, written by this process alone, says what is done."""
 
 from __future__ import annotations
 
@@ -80,9 +77,9 @@ def _new_entry(run: Run) -> RunEntry:
 def check_same_campaign(old: Manifest, new: Manifest, folder: Path) -> Manifest:
     """Return the manifest to go on with: what `old` has done, and what `new` asks for besides.
 
-    A campaign may grow (scenes, temperatures, replicas are added), never change: seeds and settings of every old run
-    must be those of the file. Raises InputError with the first key that differs. What is no longer as it was written
-    (a trajectory that is gone or of another size) waits again, and so does what failed.
+    A campaign may grow, never change: seeds and settings of every old run must be those of the file. What is no longer
+    as it was written (a trajectory that is gone or of another size) waits again, and so does what failed. Raises
+    InputError with the first key that differs.
     """
 
     def same(key: str, was: Any, now: Any) -> None:
@@ -153,10 +150,10 @@ def run_campaign(
 ) -> Manifest:
     """Run what is not yet complete on a Dask client's workers and return the manifest, which is on disk.
 
-    `progress` is called several times a second with what the workers said when last asked. `failed(name, reason)` is
-    called when a scene or a run is given up: after `retries` further attempts, or at once where its input is at fault.
-    The others run on. Ctrl-C and SIGTERM stop the active runs between two frames, with checkpoints: KeyboardInterrupt
-    with a summary. Raises what `open_campaign` raises, and InputError when another process runs the same campaign.
+    `failed(name, reason)` is called when a scene or a run is given up: after `retries` further attempts, or at once
+    where its input is at fault. The others run on. Ctrl-C and SIGTERM stop the active runs between two frames, with
+    checkpoints: KeyboardInterrupt with a summary. Raises what `open_campaign` raises, and InputError when another
+    process runs the same campaign.
     """
     with _only_process(campaign.folder), deferred_interrupt() as asked_to_stop:
         job = _Job(campaign, client, open_campaign(campaign), failed or (lambda name, reason: None))

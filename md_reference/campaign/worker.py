@@ -1,8 +1,5 @@
-"""Tasks of a campaign's workers: prepare a scene once, for all its replicas; simulate a run from wherever it stands.
-
-A run's file belongs to one task at a time (systems.files.whole_file), and a task stops by itself, with a checkpoint,
-when the campaign that started it has not been heard of for a minute.
-"""
+"""Tasks of a campaign's workers: prepare a scene once, for all its replicas; simulate a run from wherever it stands,
+until the campaign has not been heard of for a minute."""
 
 from __future__ import annotations
 

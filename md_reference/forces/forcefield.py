@@ -54,15 +54,12 @@ def resolve(scene: Scene, spec: ForceFieldSpec) -> ForceFieldSpec:
 
     Force field: ff14SB where it covers every residue, gaff2 where it covers no molecule but water and ions,
     ff14SB+gaff2 where it covers some. Solvent: TIP3P where the scene has a cell, vacuum for gaff2 alone, else obc2.
-    Model scenes have natural masses and no constraints. Raises PreparationError for what contradicts.
+    Raises PreparationError for what contradicts.
     """
     name = spec.force_field
     if (name == MODEL) != (scene.interactions is not None) and name != "auto":
-        if name == MODEL:
-            raise PreparationError(
-                f"scene {scene.name!r} has no law of its own; give a force field instead of 'model'."
-            )
-        raise PreparationError(f"scene {scene.name!r} brings its own law; leave `force_field` out.")
+        brings = "has no" if name == MODEL else "brings its"
+        raise PreparationError(f"scene {scene.name!r} {brings} own law; leave `force_field` out.")
     if name == "auto":
         name = MODEL if scene.interactions is not None else _choose(scene)
     solvent = spec.solvent
@@ -93,9 +90,9 @@ def build_system(scene: Scene, spec: ForceFieldSpec) -> Any:
     """Return the `openmm.System` of a scene: without a cell no cut-off, in one PME; no centre-of-mass removal.
 
     Particles are the scene's atoms in its order; virtual sites (OPC) come after them. The OBC2 term is OpenMM's
-    GBSAOBCForce, not the CustomGBForce of implicit/obc2.xml, which gives the same energies (a test holds them together)
-    and is several times slower on small scenes. Raises PreparationError when the force field has no parameters for a
-    residue or a molecule, or does not suit the scene's cell.
+    GBSAOBCForce, several times faster than the CustomGBForce of implicit/obc2.xml, with the same energies. Raises
+    PreparationError when the force field has no parameters for a residue or a molecule, or does not suit the scene's
+    cell.
     """
     spec = resolve(scene, spec)
     if spec.force_field == MODEL:

@@ -68,13 +68,12 @@ class Entry:
 
 
 def entry(scene: Scene, *, cached: bool = True) -> Entry:
-    """Return the GAFF2 parameters and AM1-BCC charges of a molecule.
+    """Return the GAFF2 parameters and AM1-BCC charges of a molecule: shipped ones, else those cached by `molecule_key`
+    and program versions, else made by AmberTools from the scene's bonds, charge and positions (`cached=False`: at once,
+    and nothing is kept).
 
-    Shipped ones are taken first, then those cached by `molecule_key` and program versions, and only then is AmberTools
-    run on the scene's bonds, charge and positions (`cached=False`: at once, and nothing is kept). Stereo plays no part
-    in GAFF2, and positions are left alone. What rounding leaves of the total charge is spread evenly. Raises
-    PreparationError with the reason for what GAFF2 or AM1-BCC cannot describe, and where AmberTools is needed and
-    absent.
+    Stereo plays no part in GAFF2. What rounding leaves of the total charge is spread evenly. Raises PreparationError
+    with the reason for what GAFF2 or AM1-BCC cannot describe, and where AmberTools is needed and absent.
     """
     refuse(scene)
     if not cached:
@@ -243,9 +242,9 @@ def _run_parmchk2(folder: Path) -> str:
     """Write what GAFF2's tables lack into `extra.frcmod`, and return it.
 
     parmchk2 of AmberTools 26 reads memory it has not set: on the same input it misses some of the tables in about every
-    second run, says that an angle which is there needs revision, and gives other impropers (aspirin's ring 1.1 or 10.5
-    kcal/mol). Beside the molecule it is therefore shown hydrogen cyanide, whose angle the tables hold, and is run again
-    until it finds that. Where the tables do not hold it, two runs must agree.
+    second run and gives other impropers (aspirin's ring 1.1 or 10.5 kcal/mol). Beside the molecule it is therefore
+    shown hydrogen cyanide, whose angle the tables hold, and is run again until it finds that. Where the tables do not
+    hold it, two runs must agree.
     """
     arguments = ["-i", "checked.mol2", "-f", "mol2", "-o", "extra.frcmod", "-s", "gaff2"]
     typed = (folder / "typed.mol2").read_text()

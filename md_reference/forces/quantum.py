@@ -38,10 +38,9 @@ def build_quantum_system(
     """Return an `openmm.System` whose one force is GFN2-xTB, without a cell, in vacuum or `alpb-water`.
 
     `hydrogen_mass_da`: taken from the atom a hydrogen is bonded to; None leaves natural masses. With
-    `constrain_hydrogens` bonds to hydrogen are as long as in the nearest minimum of the energy, and rigid.
-    Every force is an SCF from scratch, so that it depends on positions alone and a resumed run repeats an undisturbed
-    one. Raises PreparationError where tblite or PythonForce is missing, for elements beyond radon, for scenes too
-    large, and where that minimum is another molecule.
+    `constrain_hydrogens` bonds to hydrogen are as long as in the nearest minimum of the energy, and rigid. Every force
+    is an SCF from scratch, so that a resumed run repeats an undisturbed one. Raises PreparationError where tblite or
+    PythonForce is missing, for elements beyond radon, for scenes too large, and where that minimum is another molecule.
     """
     import openmm
 

@@ -48,17 +48,14 @@ class WaterBox:
 
 @dataclass(frozen=True)
 class ForceFieldSpec:
-    """What the forces are. `hydrogen_mass_da=None` leaves natural masses; bonds to hydrogen are always constrained
-    when `constrain_hydrogens` (needed above 1 fs).
+    """What the forces are. `hydrogen_mass_da=None` leaves natural masses; rigid bonds to hydrogen are needed above 1
+    fs.
 
     `force_field`: a protein force field; 'gaff2' (GAFF2 with AM1-BCC charges) for any other molecule; 'ff14SB+gaff2'
-    for scenes with both; 'gfn2-xtb' (quantum mechanics by tblite); 'model' for scenes with
-    `interactions`; 'auto', which `resolve` settles for a scene.
-
-    `solvent`: 'obc2' (GBSA-OBC2, Onufriev 2004, with mbondi2 radii as in OpenMM's implicit/obc2.xml), 'gbn2' (Nguyen
-    2013, mbondi3), 'amber99-obc' (the radii of OpenMM's amber99_obc.xml, ff99SB-ILDN only), 'tip3p' or 'opc' (explicit,
-    for scenes with a periodic cell: `solvation.solvate`), 'alpb-water' (Ehlert 2021; gfn2-xtb only), 'vacuum', or
-    'auto'.
+    for scenes with both; 'gfn2-xtb' (quantum mechanics by tblite); 'model' for scenes with `interactions`; 'auto',
+    which `resolve` settles. `solvent`: 'obc2' (GBSA-OBC2, Onufriev 2004, mbondi2 radii), 'gbn2' (Nguyen 2013, mbondi3),
+    'amber99-obc' (ff99SB-ILDN only), 'tip3p' or 'opc' (explicit: `solvation.solvate`), 'alpb-water' (Ehlert 2021;
+    gfn2-xtb only), 'vacuum', or 'auto'.
     """
 
     force_field: str = option("Force field: ff14SB, ff19SB, ff99SB-ILDN, charmm36, gaff2, gfn2-xtb.", "ff14SB")

@@ -31,12 +31,9 @@ class Unmatched(Exception):
 
 
 def build_templated(scene: Scene, spec: ForceFieldSpec) -> Any:
-    """Return the `openmm.System` of a scene that the templates of `spec.force_field` cover, implicit solvent included.
-
-    Where the scene's own division into residues is not known to the force field, the one found in the bond graph is
-    tried (`regrouping`). Particles are in the scene's order either way, virtual sites after all atoms.
-    Raises PreparationError when the force field has no parameters for a residue.
-    """
+    """Return the `openmm.System` of a scene that the templates of `spec.force_field` cover, implicit solvent included,
+    particles in the scene's order, virtual sites after all atoms. Where the force field does not know the scene's
+    residues, those found in the bond graph are tried. Raises PreparationError for a residue without parameters."""
     scene = _with_water_named(scene)
     try:
         return _build(scene, spec)

@@ -18,14 +18,12 @@ from md_reference.forces.spec import QUANTUM
 from md_reference.run.config import Conditions
 from md_reference.run.machine import choose_platform, make_context, platform_for
 from systems.chemistry.element_data import covalent_radius_nm
-from systems.chemistry.geometry import signed_volumes
-from systems.chemistry.graph import stereocentres
+from systems.chemistry.validity import changed_stereo
 from systems.errors import PreparationError, SimulationError, first_line, listed
 from systems.scene import FloatArray, Scene, part_of
 from systems.units import GAS_CONSTANT_KJ_MOL_K, hottest_k
 
 _VELOCITY_TOLERANCE = 1e-8
-_FLAT_NM3 = 2e-4
 _STEPS_BETWEEN_VOLUME_MOVES = 25
 # A bond is broken that is longer than so many sums of covalent radii; the longest of a minimised molecule are 1.1.
 _BROKEN = 1.25
@@ -68,16 +66,11 @@ def _openmm_errors(what: str) -> Iterator[None]:
 
 def refuse_damaged(scene: Scene, minimised_nm: FloatArray) -> None:
     """Raise PreparationError where a bond of the solute broke in the minimisation, which left positions `(n_atoms, 3)`
-    nm, or a stereocentre turned over; one that the scene has flat may go either way.
-
-    Minimising parts atoms that clash; from a geometry that is broken it can leave a bond stretched, one that runs
-    through a ring say.
-    """
-    if scene.interactions is not None:
-        return
+    nm, as one that runs through a ring does, or where its handedness changed."""
     atoms = solute_of(scene)
-    inside = np.isin(scene.bonds, atoms).all(axis=1) if len(atoms) else slice(None)
-    bonds = scene.bonds[inside]
+    if scene.interactions is not None or not len(atoms):
+        return
+    bonds = scene.bonds[np.isin(scene.bonds, atoms).all(axis=1)]
     radii_nm = np.array([sum(covalent_radius_nm(scene.elements[i]) for i in bond) for bond in bonds.tolist()])
     was, now = (np.linalg.norm(x[bonds[:, 0]] - x[bonds[:, 1]], axis=1) for x in (scene.positions_nm, minimised_nm))
     broken = np.flatnonzero((now > _BROKEN * radii_nm) & (was <= _BROKEN * radii_nm))
@@ -87,15 +80,10 @@ def refuse_damaged(scene: Scene, minimised_nm: FloatArray) -> None:
             f"{scene.name}: minimising its energy breaks the bond {listed(names, 3)} ({10 * now[broken[0]]:.2f} Å), as "
             "atoms stand in each other there; correct the coordinates, or build the molecule anew."
         )
-    centres = stereocentres(part_of(scene, atoms))
-    rows = atoms[centres] if len(atoms) else centres
-    before, after = (signed_volumes(x, rows) for x in (scene.positions_nm, minimised_nm))
-    turned = rows[(np.abs(before) > _FLAT_NM3) & (np.sign(before) != np.sign(after)), 0].tolist()
-    if turned:
-        names = [_atom_name(scene, i) for i in turned]
+    if what := changed_stereo(part_of(scene, atoms), minimised_nm[atoms][None])[0]:
         raise PreparationError(
-            f"{scene.name}: minimising its energy turns the stereocentre {listed(names)} over, as the geometry is "
-            "broken there; correct the coordinates, or build the molecule anew."
+            f"{scene.name}: when its energy is minimised {what}, as the geometry is broken there; correct the "
+            "coordinates, or build the molecule anew."
         )
 
 
@@ -107,10 +95,10 @@ def _atom_name(scene: Scene, i: int) -> str:
 class Engine:
     """One scene, one force field, one integrator, one Context. Use as a context manager or call `close`.
 
-    `conditions`: force field and ensemble resolved for the scene (`config.resolved`). `threads`: of the CPU platform,
-    where they are chosen. `system`: what `build_system` returned for this scene and these forces, where it is there
-    already; a barostat is added to it. Virtual sites are placed here and appear nowhere else.
-    Raises what `build_system` raises, and SimulationError when the platform cannot run the scene.
+    `conditions`: force field and ensemble resolved for the scene (`config.resolved`). `threads`: of the CPU platform.
+    `system`: what `build_system` returned, where it is there already; a barostat is added to it. Virtual sites are
+    placed here and appear nowhere else. Raises what `build_system` raises, and SimulationError when the platform cannot
+    run the scene.
     """
 
     def __init__(self, scene: Scene, conditions: Conditions, *, threads: int | None = None, system: Any = None) -> None:
@@ -200,8 +188,8 @@ class Engine:
     def minimise(self, *, max_iterations: int = 0) -> float:
         """Minimise in place (L-BFGS until converged when 0) and return the energy in kJ/mol.
 
-        Raises SimulationError when the energy is not finite, as with atoms on top of each other, and PreparationError
-        where quantum forces lead to another molecule.
+        Raises SimulationError when the energy is not finite, and PreparationError where quantum forces lead to another
+        molecule.
         """
         import openmm
 
@@ -244,9 +232,8 @@ class Engine:
         """Return positions, energies, time and kinetic temperature, and what else is asked for.
 
         With a bath, velocities are those of half steps (Zhang et al., J. Phys. Chem. A 123, 6056 (2019)), and so is the
-        temperature; without one they belong to the time of the positions. Raises SimulationError for a state that is
-        not finite, or hotter than the bath can make it (`hottest_k`). A model system without a bath may be as hot as it
-        likes.
+        temperature. Raises SimulationError for a state that is not finite, or hotter than the bath can make it
+        (`hottest_k`); a model system without a bath may be as hot as it likes.
         """
         # The Langevin middle integrator leaves in its velocities half of each step's noise along the constrained bonds,
         # and projects it out after the next kick. Seen as temperature it would be n_constraints / (4 n_dof) of
@@ -330,8 +317,8 @@ class Relaxed:
 
 
 class Relaxer:
-    """One Context with a spring on each atom. Use as a context manager or call `close`. `system`: an OpenMM System of
-    `scene` as `build_system` returns it; it is copied. Raises SimulationError when the platform cannot run it."""
+    """One Context with a spring on each atom. Use as a context manager or call `close`. `system`: as `build_system`
+    returns it; it is copied. Raises SimulationError when the platform cannot run it."""
 
     def __init__(self, scene: Scene, system: Any, *, platform: str = "auto", born: bool = True) -> None:
         import openmm
@@ -351,8 +338,8 @@ class Relaxer:
             self._context: Any = make_context(self._system, self._integrator, choice.name, choice.threads)
 
     def relax(self, positions_nm: npt.ArrayLike) -> Relaxed:
-        """Restore constrained bonds exactly, then minimise under the springs until converged. Raises SimulationError
-        where the energy is not finite before or after, as with atoms on top of each other."""
+        """Restore constrained bonds exactly, then minimise under the springs. Raises SimulationError where the energy
+        is not finite before or after."""
         import openmm
 
         start = np.asarray(positions_nm, dtype=np.float64)

@@ -1,9 +1,5 @@
 """Several independent replicas of one run: one process and one thread each, or up to sixteen at once in one core's
-vector registers (`md_reference.simd`).
-
-Files, records, equilibration and resuming are those of `run.simulate`; of replicas in one core one checkpoint, beside
-the first file, stands for all.
-"""
+vector registers (`md_reference.simd`), whose one checkpoint lies beside the first file."""
 
 from __future__ import annotations
 
@@ -52,12 +48,10 @@ def simulate_batch(
     """Run a replica for each of `outs`, at most `n_replicas()`; all have `config.seed` and their number in the batch.
 
     They start from the scene, its energy minimised, or from `starts_nm` (n, n_atoms, 3) as they stand; `notes` are
-    added to their records.
-
-    Frames and checkpoint are written about every two seconds; `resume` goes on from there, as it would have gone on.
-    Ctrl-C and SIGTERM stop with a checkpoint: KeyboardInterrupt. `progress` counts the frames of all replicas.
-    Raises SimdUnavailableError for what the platform cannot do, SimulationError when a replica blows up (the frames
-    before stay in the files, which say `completed: false`), and what `simulate` raises for settings and files.
+    added to their records. Frames and checkpoint are written about every two seconds; `resume` goes on from there, as
+    it would have gone on. `progress` counts the frames of all replicas. Raises SimdUnavailableError for what the
+    platform cannot do, SimulationError when a replica blows up (the frames before stay in the files, which say
+    `completed: false`), and what `simulate` raises.
     """
     config = check_run(scene, config, outs[0])
     if config.ensemble != "nvt" or config.columns:
@@ -99,8 +93,7 @@ class _Batch(StoredRun):
         self, starts_nm: npt.NDArray[np.floating] | None, asked_to_stop: Callable[[], bool],
         progress: ProgressFn | None,
     ) -> None:  # fmt: skip
-        """Go to where the batch was left, or to the starts, and equilibrate. Raises SimulationError,
-        KeyboardInterrupt."""
+        """Go to where the batch was left, or to the starts, and equilibrate. Raises SimulationError."""
         if self.resumed:
             self.simd.restore(self.blob)
             return
@@ -191,13 +184,12 @@ def simulate_replicas(
     """Run `len(outs)` replicas with seeds config.seed, config.seed + 1, ..., at most one per core at a time.
 
     `scene`: what they start from, each from a state of its own unless `config.starts` is one (`starts.many_starts`); or
-    a start for each replica. Each replica is a process with its share of the cores, one thread where there are as many
-    replicas as cores: on small scenes the fastest use of them. On platform simd up to sixteen replicas share a process.
-    `announce` gets the plan in one line, and the error of a replica that
-    fails while others run, which it may raise to end them too; `progress` counts the frames of all replicas. Ctrl-C and
-    SIGTERM stop them all with checkpoints: KeyboardInterrupt. When this process is killed outright they stop by
-    themselves. Raises InputError for a script that starts them outside `if __name__ == '__main__':`, SimulationError
-    with the first replica's reason when the others have ended; finished replicas stay on disk.
+    a start for each replica. Each is a process with its share of the cores; on platform simd up to sixteen share a
+    process. `announce` gets the plan in one line, and the error of a replica that fails while others run, which it may
+    raise to end them too; `progress` counts the frames of all replicas. Ctrl-C and SIGTERM stop them all with
+    checkpoints: KeyboardInterrupt; without this process they stop by themselves. Raises InputError for a script that
+    starts them outside `if __name__ == '__main__':`, SimulationError with the first replica's reason when the others
+    have ended.
     """
     if getattr(multiprocessing.current_process(), "_inheriting", False):
         raise SystemExit(_UNGUARDED)  # this is one of the processes, which has not come further than the user's script

@@ -71,14 +71,13 @@ def simulate(
     """Run reference MD and stream it to `out` (.h5, .dcd, .xtc): frames at save_every_ps, 2 save_every_ps ... time_ps.
 
     A checkpoint stands behind every block of frames and, in frames that take longer, every `checkpoint_every_s` of wall
-    time; frames and checkpoint are on the medium before the run goes on. So a `kill -9`, a full disk or a power failure
-    loses at most one save interval, half a second of work, or fifty times what it takes to write, whichever is the
-    longest; `resume=True` goes on from there with the same random stream, on the same platform, if the frames are still
-    those of this run. The equilibration is kept in the same way. Ctrl-C and SIGTERM stop at once with a checkpoint,
-    inside a frame if need be: KeyboardInterrupt. No other process can write `out` meanwhile.
+    time: a `kill -9`, a full disk or a power failure loses at most one save interval, half a second of work, or fifty
+    times what it takes to write, whichever is the longest. `resume=True` goes on from there with the same random
+    stream, on the same platform. Ctrl-C and SIGTERM stop at once with a checkpoint: KeyboardInterrupt. No other process
+    can write `out` meanwhile.
 
     `choice`: the platform where it has been chosen before. Raises SimulationError when coordinates stop being finite or
-    the system blows up (`Engine.state`): the frames before stay in the file, which then says `completed: false`.
+    the system blows up: the frames before stay in the file, which then says `completed: false`.
     """
     out = Path(out)
     config = check_run(scene, config, out)

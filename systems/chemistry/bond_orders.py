@@ -1,7 +1,4 @@
-"""Bond orders and formal charges from elements and connectivity, hydrogens included.
-
-The cheapest Lewis structure of a connectivity is found by integer programming.
-"""
+"""Bond orders and formal charges from elements and connectivity, hydrogens included: the cheapest Lewis structure."""
 
 from __future__ import annotations
 
@@ -69,9 +66,9 @@ def lewis_structure(
 ) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.int64]] | None:
     """Return bond orders `(n_bonds,)` and formal charges `(n_atoms,)` of the structure of least penalty, or None.
 
-    Every hydrogen must be present; no atom keeps an unpaired electron. `stated` holds orders that a file gives pairs
-    i < j, which decide between structures that are otherwise alike; `total_charge` is the only one allowed.
-    `carbon_ions` admits carbocations and carbanions.
+    Every hydrogen must be present; no atom keeps an unpaired electron. `stated`: orders that a file gives pairs i < j,
+    which decide between structures that are otherwise alike; `total_charge`: the only one allowed; `carbon_ions` admits
+    carbocations and carbanions.
     """
     pairs = [(min(i, j), max(i, j)) for i, j in bonds.tolist()]
     graph = nx.Graph(pairs)
@@ -267,11 +264,10 @@ def perceive(
     """Return bond orders `(n_bonds,)` and formal charges `(n_atoms,)` of one Kekulé structure.
 
     Every hydrogen must be present. Open valences are paired by a maximum matching (C=O before C=N before C=C); what
-    stays open is an anion on O and S, a cation on a nitrogen beside an open carbon (guanidinium, imidazolium). A
-    molecule that this leaves with an atom in no usual state is given the Lewis structure of least penalty. With
-    `positions_nm` `(n_atoms, 3)`, carbons that such a structure, a charge beside them or a C=C makes unsaturated must
-    be flat or straight: one that is not misses a hydrogen, unless it is `trusted` to have all. Raises ValenceError
-    naming the atoms that fit nothing (missing hydrogens, wrong bonds, unknown elements).
+    stays open is an anion on O and S, a cation on a nitrogen beside an open carbon. A molecule that this leaves with an
+    atom in no usual state is given the Lewis structure of least penalty. With `positions_nm` `(n_atoms, 3)`, carbons
+    that are unsaturated in such a structure, beside a charge or in C=C must be flat or straight, unless they are
+    `trusted` to have all hydrogens. Raises ValenceError naming the atoms that fit nothing.
     """
     neighbours: list[list[int]] = [[] for _ in elements]
     for i, j in bonds.tolist():
@@ -365,10 +361,8 @@ def _refuse_bent(
 
 class _Kekule:
     """One Kekulé structure by matching: `orders (n_bonds,)`, `charges (n_atoms,)`, `bad` atoms that fit nothing.
-
-    While it is made, `order` holds that of each bond (i, j), i < j, and `_open` what valence each atom has left, below
-    zero where it has too many bonds.
-    """
+    `order` holds that of each bond (i, j), i < j, and `_open` what valence each atom has left, negative with too many
+    bonds."""
 
     def __init__(
         self,

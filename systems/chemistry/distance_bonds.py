@@ -24,11 +24,9 @@ _BOND_STRETCH = 1.3
 
 
 def with_bonds_by_distance(scene: Scene, cell_nm: npt.ArrayLike | None = None) -> Scene:
-    """Return the scene with bonds, by covalent radii, for residues that hold an atom without any; else as it is.
-
-    Two atoms are bonded when they, or images of theirs in the cell `(3, 3)` nm (rows a, b, c), are nearer than the sum
-    of their radii and 0.04 nm. Ions, rare gases and virtual sites stay alone.
-    """
+    """Return the scene with bonds for residues that hold an atom without any, else as it is: two atoms are bonded when
+    they, or images of theirs in the cell `(3, 3)` nm (rows a, b, c), are nearer than the sum of their covalent radii
+    and 0.04 nm. Ions, rare gases and virtual sites stay alone."""
     virtual = np.array([e == PARTICLE for e in scene.elements])
     bonded = virtual.copy()
     bonded[scene.bonds.ravel()] = True
@@ -52,10 +50,8 @@ def with_bonds_by_distance(scene: Scene, cell_nm: npt.ArrayLike | None = None) -
 def bonds_by_distance(
     elements: Sequence[str], positions_nm: npt.ArrayLike, cell_nm: npt.ArrayLike | None = None
 ) -> IntArray:
-    """Return the pairs i < j nearer than the sum of their covalent radii and 0.04 nm; hydrogen bonds to its nearest.
-
-    With a cell `(3, 3)` nm that is wide enough to tell images apart the nearest ones count.
-    """
+    """Return the pairs i < j nearer than the sum of their covalent radii and 0.04 nm, by nearest images where a cell
+    `(3, 3)` nm is wide enough to tell them apart; hydrogen bonds to its nearest."""
     x = np.asarray(positions_nm, dtype=np.float64)
     radii = np.array([covalent_radius_nm(e) for e in elements])
     reach = 2.0 * float(radii.max(initial=0.0)) + _TOLERANCE_NM
@@ -99,11 +95,9 @@ def refuse_long_bonds(
 
 
 def changed_bond(scene: Scene, positions_nm: npt.ArrayLike, *, stretch: float = _BOND_STRETCH) -> str:
-    """Return what of the scene's bonds does not hold at `positions_nm` (n_atoms, 3), in words; empty where all hold.
-
-    A bond is lost where it is longer than `stretch` sums of covalent radii; a hydrogen has moved where it is nearest,
-    in units of that sum, to an atom it is not bonded to.
-    """
+    """Return what of the scene's bonds does not hold at `positions_nm` (n_atoms, 3), in words; empty where all hold: a
+    bond longer than `stretch` sums of covalent radii, or a hydrogen nearest, in units of that sum, to an atom it is not
+    bonded to."""
     if not len(scene.bonds):
         return ""
     x = np.asarray(positions_nm, dtype=np.float64)
@@ -186,10 +180,8 @@ def cell_of(numbers: Sequence[float]) -> FloatArray | None:
 
 def images_of_whole(positions_nm: FloatArray, cell_nm: FloatArray, pairs: IntArray) -> IntArray:
     """Return how many of each cell vector to add to each atom, `(n_atoms, 3)`, so that all `pairs` `(n, 2)` are at
-    their nearest images; the largest uncut part of each molecule stays where it is.
-
-    A molecule that is bonded to an image of itself has no such place, and is left as it is.
-    """
+    their nearest images; the largest uncut part of each molecule stays where it is. A molecule that is bonded to an
+    image of itself is left as it is."""
     n = len(positions_nm)
     images = np.zeros((n, 3), dtype=np.int64)
     steps = -np.rint((positions_nm[pairs[:, 1]] - positions_nm[pairs[:, 0]]) @ np.linalg.inv(cell_nm)).astype(np.int64)
@@ -217,10 +209,8 @@ def bonded_images(
     elements: Sequence[str], positions_nm: FloatArray, cell_nm: FloatArray
 ) -> tuple[IntArray, FloatArray]:
     """Return the pairs i < j `(n, 2)` any images of which are within a bond's length, and the distances `(n,)` nm.
-
     Metals are bonded to nothing. In a cell too small for its atoms, which is another structure's, there are none.
-    Raises PreparationError where most atoms stand in each other.
-    """
+    Raises PreparationError where most atoms stand in each other."""
     if len(elements) > _DENSEST_PER_NM3 * abs(float(np.linalg.det(cell_nm))):
         return np.empty((0, 2), dtype=np.int64), np.empty(0)
     pairs, length = _near_images(positions_nm, cell_nm, _LONGEST_BOND_NM)

@@ -149,11 +149,9 @@ PH_OF_FEWEST = 14.0
 
 @dataclass(frozen=True)
 class Component:
-    """A residue as the dictionary has it, mostly uncharged and alone.
-
-    Per heavy atom: name, element, formal charge and the names of its hydrogens, those first that leave when the residue
-    is linked. `bonds`: pairs of heavy atoms with their order. `kind`: peptide, nucleotide or saccharide.
-    """
+    """A residue as the dictionary has it, mostly uncharged and alone. Per heavy atom: name, element, formal charge and
+    the names of its hydrogens, those first that leave when the residue is linked. `bonds`: pairs of heavy atoms with
+    their order. `kind`: peptide, nucleotide or saccharide."""
 
     name: str
     kind: str
@@ -218,12 +216,9 @@ def known_template(residue_name: str) -> ResidueTemplate | None:
 def hydrogens_of(
     residue: Component, present: Collection[str], links: Mapping[str, int], *, ph: float
 ) -> list[tuple[str, str]]:
-    """Return (name, heavy atom) of each hydrogen of a residue with these heavy atoms `present` at this pH.
-
-    `links`: how many bonds each heavy atom has to other residues. Each takes the place of a hydrogen, or of an atom
-    that leaves (OXT). Groups are charged by their usual pKa: carboxylic, phosphoric and sulfuric acids, amines,
-    guanidines and imidazoles.
-    """
+    """Return (name, heavy atom) of each hydrogen of a residue with these heavy atoms `present` at this pH, groups
+    charged by their usual pKa. `links`: how many bonds each heavy atom has to other residues; each takes the place of a
+    hydrogen, or of an atom that leaves (OXT)."""
     near: list[list[tuple[int, int]]] = [[] for _ in residue.heavy]
     for i, j, order in residue.bonds:
         near[i].append((j, order))
