@@ -196,9 +196,13 @@ def _listed(names: Sequence[str]) -> str:
     return " or ".join([", ".join(names[:-1]), names[-1]] if len(names) > 1 else names)
 
 
-@cache
-def options_of(kind: Any) -> dict[str, Option]:
+def options_of(kind: type) -> dict[str, Option]:
     """Return the options of a dataclass by name: its own, then those of its bases, each in the order they stand in."""
+    return _options_of(kind)
+
+
+@cache
+def _options_of(kind: Any) -> dict[str, Option]:
     hints = get_type_hints(kind)
     declared = {f.name: f for f in fields(kind) if _KEY in f.metadata}
     order = dict.fromkeys(name for each in kind.__mro__ for name in get_annotations(each) if name in declared)

@@ -158,7 +158,7 @@ def _build_mixed(scene: Scene, spec: ForceFieldSpec) -> Any:
                 f"{spec.protein} has no parameters for {', '.join(chain.lacking[:4])} of scene {scene.name!r}; such "
                 "residues are joined to ff14SB alone: use `force_field='ff14SB+gaff2'`."
             )
-        parts.append((atoms, build_chain(part, spec) if chain is not None else _build_molecule(part, spec)))
+        parts.append((atoms, build_chain(chain, spec) if chain is not None else _build_molecule(part, spec)))
     system = merge(scene.n_atoms, parts)
     if spec.is_explicit:
         nonbonded = next(f for f in system.getForces() if isinstance(f, NonbondedForce))

@@ -46,24 +46,23 @@ def solute_of(scene: Scene) -> IntArray:
 # ---- residues -------------------------------------------------------------------------------------------------------
 
 
-def regroup(scene: Scene, *, uncut: Iterable[tuple[int, int]] = ()) -> tuple[Scene, IntArray]:
+def regroup(scene: Scene) -> tuple[Scene, IntArray]:
     """Return the scene with its atoms gathered into residues, and `order (n_atoms,)`: its atom k was atom `order[k]`.
 
     Residues are what is left connected when the amide bonds of the backbone (C(=O)-N between carbons, and that of an
-    NH2 that ends a chain) and the disulfide bonds are cut, except the bonds `uncut` (i < j); they follow the chain from
-    N to C terminus, atoms keep their order within one. Force fields recognise residues by their bonds, so a whole
-    peptide in one residue 'UNL', or residues whose atoms lie mixed, become what OpenMM's templates know.
+    NH2 that ends a chain) and the disulfide bonds are cut; they follow the chain from N to C terminus, atoms keep their
+    order within one. Force fields recognise residues by their bonds, so a whole peptide in one residue 'UNL', or
+    residues whose atoms lie mixed, become what OpenMM's templates know.
 
     In residues with several equal neighbours about a planar atom (ARG, TRP, HIS) Amber's improper torsions depend on
     the order of atoms, by some tenths of a kJ/mol.
     """
-    kept = set(uncut)
     ends = np.array(_amide_ends(scene), dtype=np.int64).reshape(-1, 2)
     amides = np.concatenate([backbone_torsions(scene)["omega"][:, 1:3], ends]).tolist()
     cut = {(min(c, n), max(c, n)) for c, n in amides}
     cut |= {(i, j) for i, j in scene.bonds.tolist() if scene.elements[i] == scene.elements[j] == "S"}
     pieces = bonded_graph(scene).copy()
-    pieces.remove_edges_from(cut - kept)
+    pieces.remove_edges_from(cut)
     residues = [sorted(part) for part in nx.connected_components(pieces)]
     of_atom = {atom: k for k, atoms in enumerate(residues) for atom in atoms}
     along: nx.DiGraph = nx.DiGraph()
