@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 import numpy.typing as npt
@@ -14,9 +14,9 @@ import numpy.typing as npt
 from md_reference.forces.forcefield import build_system
 from md_reference.forces.mixture import solute_of
 from md_reference.forces.quantum import refuse_rearranged
-from md_reference.forces.spec import QUANTUM
+from md_reference.forces.spec import QUANTUM, ForceFieldSpec
 from md_reference.run.config import Conditions
-from md_reference.run.machine import choose_platform, make_context, platform_for
+from md_reference.run.machine import make_context, platform_for
 from systems.chemistry.element_data import covalent_radius_nm
 from systems.chemistry.validity import changed_stereo
 from systems.errors import PreparationError, SimulationError, first_line, listed
@@ -133,7 +133,7 @@ class Engine:
         # Degrees of freedom that hold kinetic energy; without a bath those of the centre of mass are at rest.
         self.n_dof = 3 * int(np.count_nonzero(self._masses_da)) - self.n_constraints - 3 * self._keeps_momentum
 
-    def __enter__(self) -> Engine:
+    def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -261,7 +261,7 @@ class Engine:
             raise SimulationError(f"the system blew up (kinetic temperature {state.temperature_k:.3g} K)")
         return state
 
-    def _query(self, **what: bool) -> Any:
+    def _query(self, **what: Any) -> Any:
         """Return OpenMM's State; some platforms notice here that coordinates are no longer finite."""
         with _openmm_errors("evaluation failed"):
             return self._context.getState(**what)
@@ -316,63 +316,38 @@ class Relaxed:
     potential_kj_mol: float
 
 
-class Relaxer:
-    """One Context with a spring on each atom. Use as a context manager or call `close`. `system`: as `build_system`
-    returns it; it is copied. Raises SimulationError when the platform cannot run it."""
+class Relaxer(Engine):
+    """An engine with a spring on each atom. `system`: as `build_system` returns it; it is copied."""
 
     def __init__(self, scene: Scene, system: Any, *, platform: str = "auto", born: bool = True) -> None:
         import openmm
 
-        self._n_atoms, self._system = scene.n_atoms, openmm.XmlSerializer.clone(system)
+        held = openmm.XmlSerializer.clone(system)
         self._springs = openmm.CustomExternalForce("0.5*k*((x-x0)^2+(y-y0)^2+(z-z0)^2)")
         self._springs.addGlobalParameter("k", _SPRING_KJ_MOL_NM2)
         for name in ("x0", "y0", "z0"):
             self._springs.addPerParticleParameter(name)
-        for k in range(self._n_atoms):
+        for k in range(scene.n_atoms):
             self._springs.addParticle(k, [0.0, 0.0, 0.0])
         self._springs.setForceGroup(_SPRINGS_GROUP)
-        self._system.addForce(self._springs)
-        self._integrator = openmm.VerletIntegrator(0.001)
-        choice = choose_platform(scene.n_atoms, platform, born=born)
-        with _openmm_errors(f"platform {choice.name} cannot run {scene.name!r}"):
-            self._context: Any = make_context(self._system, self._integrator, choice.name, choice.threads)
+        held.addForce(self._springs)
+        # Of the forces only whether they have a Born term matters here, for the choice of a platform.
+        spec = ForceFieldSpec("auto", "auto" if born else "vacuum")
+        super().__init__(scene, Conditions(force=spec, platform=platform), system=held)
 
     def relax(self, positions_nm: npt.ArrayLike) -> Relaxed:
         """Restore constrained bonds exactly, then minimise under the springs. Raises SimulationError where the energy
         is not finite before or after."""
-        import openmm
-
         start = np.asarray(positions_nm, dtype=np.float64)
         if not np.isfinite(start).all():
             raise SimulationError("a frame that is not finite cannot be relaxed")
         for k, at in enumerate(start.tolist()):
             self._springs.setParticleParameters(k, k, at)
-        virtual = np.zeros((self._system.getNumParticles() - self._n_atoms, 3))
         with _openmm_errors("relaxation failed"):
             self._springs.updateParametersInContext(self._context)
-            self._context.setPositions(np.concatenate([start, virtual]))
-            self._context.computeVirtualSites()
-            if not math.isfinite(self._potential()):
+            if not math.isfinite(self.energy(start)):
                 raise SimulationError("the energy of a frame to relax is not finite; atoms lie on top of each other")
             self._context.applyConstraints(_CONSTRAINT_TOLERANCE)
-            openmm.LocalEnergyMinimizer.minimize(self._context)
-            raw = self._context.getState(positions=True)
-        relaxed = np.asarray(raw.getPositions(asNumpy=True)._value, dtype=np.float64)[: self._n_atoms]
-        energy = self._potential()
-        if not (math.isfinite(energy) and np.isfinite(relaxed).all()):
-            raise SimulationError("relaxation failed: coordinates or energy are no longer finite")
-        return Relaxed(relaxed, energy)
-
-    def _potential(self) -> float:
-        raw = self._context.getState(energy=True, groups=~(1 << _SPRINGS_GROUP) & 0xFFFFFFFF)
-        return float(raw.getPotentialEnergy()._value)
-
-    def close(self) -> None:
-        """Free the Context. The relaxer cannot be used afterwards."""
-        self._context = None
-
-    def __enter__(self) -> Relaxer:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
+            self.minimise()
+        without_springs = self._query(energy=True, groups=~(1 << _SPRINGS_GROUP) & 0xFFFFFFFF)
+        return Relaxed(self.positions(), float(without_springs.getPotentialEnergy()._value))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import platform as machine
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from typing import Annotated, Any
@@ -82,12 +82,14 @@ def simd_choice() -> PlatformChoice:
     return PlatformChoice(SIMD, 1, f"{n_replicas()} replicas at once on a core, forces checked against OpenMM's")
 
 
-def choose_platform(n_atoms: int, requested: str = "auto", *, born: bool = True) -> PlatformChoice:
-    """Return the platform for `n_atoms`, with a generalised Born term or without, on one thread; a request is checked.
+def platform_for(scene: Scene, conditions: Conditions, *, max_threads: int = 1) -> PlatformChoice:
+    """Return the platform for a scene under these conditions, the forces resolved: the one that they name, else by the
+    scene's size, so that the same run takes the same one everywhere. `max_threads`: cores for this replica.
 
     Raises UnknownNameError (with the nearest name) for a platform that is not here, InputError for simd, in which
     OpenMM does not run.
     """
+    n_atoms, requested, born = scene.n_atoms, conditions.platform, conditions.force.solvent != "vacuum"
     available = [*platforms(), SIMD]
     if requested == SIMD:
         raise InputError("platform simd is for replicas of `reference` and `run`; take another platform here.")
@@ -96,28 +98,18 @@ def choose_platform(n_atoms: int, requested: str = "auto", *, born: bool = True)
             f"platform {requested!r} is not available here; there are: {', '.join(available)}."
             + nearest(requested, available)
         )
-    if requested != "auto":
-        return PlatformChoice(requested, 1, "asked for")
     largest = REFERENCE_MAX_ATOMS_BORN if born else REFERENCE_MAX_ATOMS_VACUUM
-    if n_atoms <= largest:
-        return PlatformChoice("Reference", 1, f"{n_atoms} atoms: no neighbour lists and no threads to wait for")
     device = next((name for name in _DEVICES if name in available and n_atoms > GPU_MIN_ATOMS), None)
-    if device is not None:
-        return PlatformChoice(device, 1, f"{n_atoms} atoms and a {device} device")
-    return PlatformChoice("CPU", 1, f"{n_atoms} atoms: vector instructions win above {largest}")
-
-
-def platform_for(scene: Scene, conditions: Conditions, *, max_threads: int = 1) -> PlatformChoice:
-    """Return the platform for a scene under these conditions, the forces resolved: the one that they name, else by the
-    scene's size, so that the same run takes the same one everywhere. `max_threads`: cores for this replica.
-
-    Raises what `choose_platform` raises.
-    """
-    spec = conditions.force
-    if spec.force_field == QUANTUM and conditions.platform == "auto":
-        return PlatformChoice("Reference", 1, "the quantum program takes all the time of a step")
-    choice = choose_platform(scene.n_atoms, conditions.platform, born=spec.solvent != "vacuum")
-    if choice.name == "CPU" and scene.n_atoms >= _THREADS_MIN_ATOMS and max_threads > 1:
-        reason = f"{choice.reason}, {max_threads} threads from {_THREADS_MIN_ATOMS} on"
-        return replace(choice, threads=max_threads, reason=reason)
-    return choice
+    if requested != "auto":
+        name, reason = requested, "asked for"
+    elif conditions.force.force_field == QUANTUM:
+        name, reason = "Reference", "the quantum program takes all the time of a step"
+    elif n_atoms <= largest:
+        name, reason = "Reference", f"{n_atoms} atoms: no neighbour lists and no threads to wait for"
+    elif device is not None:
+        name, reason = device, f"{n_atoms} atoms and a {device} device"
+    else:
+        name, reason = "CPU", f"{n_atoms} atoms: vector instructions win above {largest}"
+    if name == "CPU" and n_atoms >= _THREADS_MIN_ATOMS and max_threads > 1:
+        return PlatformChoice(name, max_threads, f"{reason}, {max_threads} threads from {_THREADS_MIN_ATOMS} on")
+    return PlatformChoice(name, 1, reason)

@@ -28,14 +28,7 @@ def torsion(positions_nm: npt.ArrayLike, quads: npt.ArrayLike) -> FloatArray:
     Computed in the dtype given, float32 or float64. Raises InputError for arrays of another shape.
     """
     x, single = _frames(positions_nm)
-    idx = np.asarray(quads, dtype=np.int64).reshape(-1, 4)
-    a, b, c, d = (x[:, idx[:, k]] for k in range(4))
-    middle = c - b
-    first = np.cross(b - a, middle)
-    second = np.cross(middle, d - c)
-    sine = np.einsum("nkx,nkx->nk", b - a, second) * np.linalg.norm(middle, axis=-1)
-    cosine = np.einsum("nkx,nkx->nk", first, second)
-    angles: FloatArray = np.arctan2(sine, cosine)
+    angles = torsion_angle(x.transpose(2, 1, 0), np.asarray(quads, dtype=np.int64).reshape(-1, 4)).T
     return angles[0] if single else angles
 
 
@@ -61,10 +54,7 @@ def signed_volumes(positions_nm: npt.ArrayLike, quads: npt.ArrayLike) -> FloatAr
     """Return the signed volumes `(n_frames, k)` nm^3 of (b-a) x (c-a) . (d-a) for quadruples (a, b, c, d) `(k, 4)`; one
     frame `(n_atoms, 3)` gives `(k,)`. For a stereocentre `a` with neighbours b, c, d the sign is its handedness."""
     x, single = _frames(positions_nm)
-    idx = np.asarray(quads, dtype=np.int64).reshape(-1, 4)
-    origin = x[:, idx[:, 0]]
-    b, c, d = (x[:, idx[:, k]] - origin for k in (1, 2, 3))
-    volumes: FloatArray = np.einsum("nkx,nkx->nk", np.cross(b, c), d)
+    volumes = signed_volume(x.transpose(2, 1, 0), np.asarray(quads, dtype=np.int64).reshape(-1, 4)).T
     return volumes[0] if single else volumes
 
 

@@ -10,7 +10,7 @@ import pytest
 
 from md_reference.forces.spec import ForceFieldSpec
 from md_reference.run.config import Conditions, MDConfig
-from md_reference.run.machine import available_cores, choose_platform, platform_for
+from md_reference.run.machine import available_cores, platform_for
 from md_reference.run.plan import make_plan
 from systems.errors import InputError, UnknownNameError
 from systems.scene import Scene
@@ -70,7 +70,8 @@ def test_the_wall_time_of_a_length_is_estimated(alanine_dipeptide: Scene) -> Non
     [(22, True, "Reference"), (62, True, "CPU"), (62, False, "Reference"), (150, False, "CPU")],
 )
 def test_the_platform_follows_the_size_and_the_solvent(n_atoms: int, born: bool, platform: str) -> None:
-    choice = choose_platform(n_atoms, born=born)
+    spec = ForceFieldSpec("auto", "obc2" if born else "vacuum")
+    choice = platform_for(SimpleNamespace(n_atoms=n_atoms), Conditions(force=spec))  # type: ignore[arg-type]
     assert choice.name == platform
     assert choice.threads == 1
     assert str(n_atoms) in choice.reason
