@@ -17,7 +17,7 @@ from systems.errors import InputError, SurromdError, nearest
 from systems.files.schema import built, fitted
 from systems.library.named_scenes import find_protocol
 from systems.options import Preparation, options_of, read_toml
-from systems.units import parse_wall_s, quantity
+from systems.units import quantity
 
 T = TypeVar("T")
 SCENE_FILES = (".pdb", ".ent", ".cif", ".mmcif", ".gz", ".sdf", ".mol", ".mol2")
@@ -57,7 +57,6 @@ class Campaign:
     scenes: tuple[SceneSpec, ...]
     runs: tuple[Run, ...]
     retries: int = 2
-    checkpoint_every_s: float = 20.0
 
 
 @dataclass(frozen=True)
@@ -79,7 +78,6 @@ class _Head:
     format: Literal["h5", "dcd", "xtc"] = "h5"
     seed: Annotated[int, range(2**63)] = 0
     retries: Annotated[int, range(1000)] = 2
-    checkpoint_every: str = "20s"
 
 
 @dataclass(frozen=True)
@@ -139,7 +137,6 @@ def _campaign(table: dict[str, Any], path: Path, folder: Path | None) -> Campaig
         scenes=tuple(scenes),
         runs=tuple(runs),
         retries=head.retries,
-        checkpoint_every_s=parse_wall_s(head.checkpoint_every, "checkpoint_every"),
         file=path,
     )
 

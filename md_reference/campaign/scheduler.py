@@ -272,7 +272,7 @@ class _Job:
             priority = 1 << 62
         else:
             expected = self.manifest.runs[task.name].frames_sha256
-            own = ("simulate_run", self._token, task, self._campaign.checkpoint_every_s, expected)
+            own = ("simulate_run", self._token, task, expected)
             n_steps = task.config.n_frames * task.config.steps_per_frame
             priority = (self.manifest.scenes[task.scene].n_atoms or 1) * n_steps
         future = self._client.submit(_work, self._token, self._folder, *own, key=key, priority=priority)

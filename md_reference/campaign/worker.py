@@ -128,7 +128,7 @@ def load_prepared(path: Path) -> PreparedScene:
         raise InputError(f"{path} cannot be read ({error}); delete it to have the scene prepared again.") from error
 
 
-def simulate_run(folder: Path, token: str, run: Run, checkpoint_every_s: float, expected: str) -> dict[str, Any]:
+def simulate_run(folder: Path, token: str, run: Run, expected: str) -> dict[str, Any]:
     """Simulate a run, or go on with it, and return what the manifest says of it when it is complete. `expected`: the
     hash of its frames, where the manifest already has one."""
     session = session_of(token)
@@ -145,10 +145,9 @@ def simulate_run(folder: Path, token: str, run: Run, checkpoint_every_s: float, 
     # A worker that this one stands in for, cut off and not yet stopped, may still have the file.
     OutputLock(out, patience_s=2 * LEASE_S, stopped=session.should_stop).close()
     start, config = prepared.start_of(run.replica, run.config), replace(run.config, force=prepared.force)
-    how: dict[str, Any] = {"checkpoint_every_s": checkpoint_every_s, "choice": prepared.platform}
     session.frames[run.name] = 0
     try:
-        simulate(start, config, out, resume=True, progress=report, **how)
+        simulate(start, config, out, resume=True, progress=report, choice=prepared.platform)
     finally:
         session.frames.pop(run.name, None)
     with open_trajectory(out) as reader:

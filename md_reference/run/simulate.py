@@ -65,16 +65,14 @@ def simulate(
     resume: bool = False,
     overwrite: bool = False,
     progress: ProgressFn | None = None,
-    checkpoint_every_s: float = 20.0,
     choice: PlatformChoice | None = None,
 ) -> Path:
     """Run reference MD and stream it to `out` (.h5, .dcd, .xtc): frames at save_every_ps, 2 save_every_ps ... time_ps.
 
-    A checkpoint stands behind every block of frames and, in frames that take longer, every `checkpoint_every_s` of wall
-    time: a `kill -9`, a full disk or a power failure loses at most one save interval, half a second of work, or fifty
-    times what it takes to write, whichever is the longest. `resume=True` goes on from there with the same random
-    stream, on the same platform. Ctrl-C and SIGTERM stop at once with a checkpoint: KeyboardInterrupt. No other process
-    can write `out` meanwhile.
+    A checkpoint stands behind every block of frames: a `kill -9`, a full disk or a power failure loses at most one save
+    interval, half a second of work, or fifty times what it takes to write, whichever is the longest. `resume=True` goes
+    on from there with the same random stream, on the same platform. Ctrl-C and SIGTERM stop at once, with a checkpoint
+    at the last frame: KeyboardInterrupt. No other process can write `out` meanwhile.
 
     `choice`: the platform where it has been chosen before. Raises SimulationError when coordinates stop being finite or
     the system blows up: the frames before stay in the file, which then says `completed: false`.
@@ -88,7 +86,7 @@ def simulate(
             return out
         kept = supported_checkpoint(chk, [out]) if resume and chk.exists() else None
         run = _Run(scene, config, out, kept, overwrite=overwrite)
-        run.asked_to_stop, run.progress, run.checkpoint_every_s = asked_to_stop, progress, checkpoint_every_s
+        run.asked_to_stop, run.progress = asked_to_stop, progress
         run.prepare(choice)
         with run.engine_at_start() as engine, run.writer() as writer:
             run.produce(engine, writer)
@@ -98,14 +96,12 @@ def simulate(
 
 @dataclass(frozen=True)
 class Stand:
-    """Where a run stands, as its checkpoint says beside what all of them do; while it equilibrates, so far."""
+    """Where a run stands, as its checkpoint says beside what all of them do."""
 
     config: dict[str, Any] = field(default_factory=dict)
     wall_s: float = 0.0
     platform: str = ""
     threads: Annotated[int, range(1, 1025)] = 1
-    steps_into_frame: Annotated[int, range(2**63)] = 0
-    equilibrated_steps: Annotated[int, range(2**63)] | None = None
 
 
 class StoredRun:
@@ -124,6 +120,9 @@ class StoredRun:
             raise InputError(f"checkpoint {checkpoint_path(outs[0])} cannot be gone on from ({error}).") from error
         if self.resumed:
             check_same_run(self.stand.config, config, outs[0])
+            if self.header.get("steps_into_frame") or self.header.get("equilibrated_steps") is not None:
+                chk = checkpoint_path(outs[0])
+                raise InputError(f"{chk} stands inside a frame, as an earlier version left it; start with `overwrite`.")
         self.began = time.monotonic()
         self.done = int(self.header["files"][0]["n_frames"])
         solute = config.kept_atoms(scene)
@@ -189,12 +188,10 @@ class _Run(StoredRun):
 
     asked_to_stop: Callable[[], bool] = staticmethod(lambda: False)
     progress: ProgressFn | None = None
-    checkpoint_every_s = 20.0
 
     def __init__(self, scene: Scene, config: MDConfig, out: Path, kept: Checkpoint | None, *, overwrite: bool) -> None:
         super().__init__(scene, config, [out], kept, overwrite=overwrite)
-        self.steps_into_frame, self.saved_at, self.piece = self.stand.steps_into_frame, self.began, 10
-        self.system: Any = None
+        self.piece, self.system = 10, None
 
     def prepare(self, choice: PlatformChoice | None) -> None:
         """Build the forces and settle the platform."""
@@ -209,14 +206,14 @@ class _Run(StoredRun):
 
     def engine_at_start(self) -> Engine:
         """Return the engine where the run was left, or at time 0."""
-        if self.resumed and self.stand.equilibrated_steps is None:
+        if self.resumed:
             engine = self.engine(self.config.ensemble)
             engine.restore(self.blob)
-        else:
-            engine = self._equilibrated()
-        if not self.done:
-            # Before there is a file, so that a run killed at any later moment can be resumed like any other.
-            self.save(engine)
+            return engine
+        engine = self._equilibrated()
+        # Before there is a file, so that a run killed at any later moment can be resumed like any other.
+        self.blob = engine.checkpoint()
+        self.save(engine)
         return engine
 
     def writer(self) -> TrajectoryWriter:
@@ -244,21 +241,15 @@ class _Run(StoredRun):
 
     def _equilibrate(self, engine: Engine) -> None:
         n_steps = math.ceil(round(self.config.equilibrate_ps / self.config.timestep_ps, 6))
-        done = self.stand.equilibrated_steps or 0
-        report_preparing(self.progress, done / max(n_steps, 1))
-        if self.blob:
-            engine.restore(self.blob)
-        else:
-            engine.minimise()
-            refuse_damaged(self.scene, engine.positions())
-            engine.thermalise()
+        report_preparing(self.progress, 0.0)
+        engine.minimise()
+        refuse_damaged(self.scene, engine.positions())
+        engine.thermalise()
+        done = 0
         while done < n_steps:
             done += self._advance(engine, n_steps - done)
             report_preparing(self.progress, done / n_steps)
-            stop = self.asked_to_stop()
-            if stop or time.monotonic() - self.saved_at > self.checkpoint_every_s:
-                self.save(engine, equilibrated_steps=done)
-            if stop:
+            if self.asked_to_stop():
                 raise KeyboardInterrupt
         engine.state()
 
@@ -271,10 +262,9 @@ class _Run(StoredRun):
         self.piece = max(1, min(2 * self.piece, math.ceil(taken * _SIGNAL_S / seconds), 100_000))
         return taken
 
-    def save(self, engine: Engine, **more: Any) -> None:
-        """Write the checkpoint."""
-        self.keep(engine.checkpoint(), platform=engine.platform_name, threads=engine.threads, **more)
-        self.saved_at = time.monotonic()
+    def save(self, engine: Engine) -> None:
+        """Write the checkpoint, which stands at the last frame."""
+        self.keep(self.blob, platform=engine.platform_name, threads=engine.threads)
 
     def produce(self, engine: Engine, writer: TrajectoryWriter) -> None:
         """Append frames until all are there. Raises SimulationError, StorageError, KeyboardInterrupt."""
@@ -290,7 +280,7 @@ class _Run(StoredRun):
             self.refuse_failed(failure, [writer], f"{self.outs[0]}. {_advice(config)}")
             stop = self.asked_to_stop() and self.done < n_frames
             if self.done < n_frames:
-                self.save(engine, steps_into_frame=self.steps_into_frame)
+                self.save(engine)
             flushed_s = time.monotonic() - computed
             if self.progress is not None:
                 self.progress(self.done, n_frames)
@@ -306,14 +296,13 @@ class _Run(StoredRun):
         config, per_frame = self.config, self.config.steps_per_frame
         while len(states) < n:
             try:
-                while self.steps_into_frame < per_frame:
+                steps = 0
+                while steps < per_frame:
                     if self.asked_to_stop():
                         return states, ""
-                    self.steps_into_frame += self._advance(engine, per_frame - self.steps_into_frame)
-                    if not states and time.monotonic() - self.saved_at > self.checkpoint_every_s:
-                        self.save(engine, steps_into_frame=self.steps_into_frame)
+                    steps += self._advance(engine, per_frame - steps)
                 states.append(engine.state(velocities=config.save_velocities, forces=config.save_forces))
-                self.steps_into_frame = 0
+                self.blob = engine.checkpoint()
             except SimulationError as error:
                 return states, str(error)
         return states, ""

@@ -49,7 +49,7 @@ GONE, MORE = object(), object()
 WRONG: tuple[Any, ...] = (GONE, MORE, None, "x", "", "a\0b", "\ud800", "../../x", 0, -1, 3, 2.5, 10**30, 1e308,
                           float("inf"), float("nan"), True, [], {}, [[1]], {"a": 1}, ["x"])  # fmt: skip
 CAMPAIGN = {
-    "name": "c", "out": "folder", "format": "h5", "seed": 3, "retries": 1, "checkpoint_every": "20s", "replicas": 2,
+    "name": "c", "out": "folder", "format": "h5", "seed": 3, "retries": 1, "replicas": 2,
     "temperatures": ["300K", 350], "time": "10ps", "save_every": "1ps", "timestep": "2fs", "platform": "Reference",
     "solvent": "vacuum", "hydrogen_mass": "natural", "constrain_hydrogens": True, "ph": 7, "padding_nm": 1.0,
     "scenes": [{"scene": "alanine-dipeptide", "name": "a", "replicas": 1, "keep_water": False}, "ethanol"],
@@ -195,7 +195,7 @@ def reference_kind(folder: Path) -> Kind:
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        simulate(scene, config, out, progress=stop, checkpoint_every_s=0.0)
+        simulate(scene, config, out, progress=stop)
     header, blob = read_checkpoint(checkpoint_path(out))
     files = {path: path.read_bytes() for path in folder.iterdir()}
 

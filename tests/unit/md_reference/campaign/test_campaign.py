@@ -35,7 +35,6 @@ timestep = "2fs"
 equilibrate = "200fs"
 solvent = "vacuum"
 platform = "Reference"
-checkpoint_every = "0.01s"
 """
 
 

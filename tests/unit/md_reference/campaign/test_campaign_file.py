@@ -42,7 +42,6 @@ def test_runs_are_scenes_times_temperatures_times_replicas(tmp_path: Path, repos
         solvent = "vacuum"
         hydrogen_mass = "natural"
         constrain_hydrogens = false
-        checkpoint_every = "5s"
         retries = 0
         ph = 6.5
 
@@ -89,7 +88,7 @@ def test_runs_are_scenes_times_temperatures_times_replicas(tmp_path: Path, repos
     )
     assert campaign.runs[4].config.time_ps == 2000.0
     assert campaign.runs[6].file == "gly/290K/gly_290K_r0.h5"
-    assert (campaign.retries, campaign.checkpoint_every_s) == (0, 5.0)
+    assert campaign.retries == 0
     assert [scene.preparation["ph"] for scene in campaign.scenes] == [6.5, 4, 4, 6.5]
     assert campaign.scenes[1].source == str(tmp_path / "pdb" / "a.pdb")
     assert len(campaign.scenes[1].source_sha256) == 64
