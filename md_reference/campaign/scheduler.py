@@ -109,10 +109,7 @@ def check_same_campaign(old: Manifest, new: Manifest, folder: Path) -> Manifest:
             same(f"{key} of scene {run.scene}", was, now)
         file = folder / run.file
         if run.status != COMPLETE or not file.is_file() or file.stat().st_size != run.size_bytes:
-            # What is gone is made anew, and need not come out the same on another machine; what is there must be what
-            # it was.
-            kept = run.frames_sha256 if file.is_file() else ""
-            run = replace(run, status=WAITING, reason="", n_frames=0, frames_sha256=kept)
+            run = replace(run, status=WAITING, reason="", n_frames=0)
         runs[name] = run
     return replace(new, scenes=scenes, runs=runs, started=old.started)
 
@@ -271,8 +268,7 @@ class _Job:
             own = ("prepare_scene", task, runs[0].config, seed, 1 + max(run.replica for run in runs))
             priority = 1 << 62
         else:
-            expected = self.manifest.runs[task.name].frames_sha256
-            own = ("simulate_run", self._token, task, expected)
+            own = ("simulate_run", self._token, task)
             n_steps = task.config.n_frames * task.config.steps_per_frame
             priority = (self.manifest.scenes[task.scene].n_atoms or 1) * n_steps
         future = self._client.submit(_work, self._token, self._folder, *own, key=key, priority=priority)

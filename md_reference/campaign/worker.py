@@ -15,7 +15,7 @@ import numpy as np
 
 from md_reference.campaign.campaign_file import Run, SceneSpec
 from md_reference.campaign.cluster import LEASE_S, session_of
-from md_reference.campaign.manifest import MANIFEST_NAME, file_sha256, frames_sha256
+from md_reference.campaign.manifest import file_sha256, frames_sha256
 from md_reference.forces.forcefield import build_system, resolve
 from md_reference.forces.solvation import require_molecules, solvate
 from md_reference.forces.spec import ForceFieldSpec, WaterBox
@@ -128,9 +128,8 @@ def load_prepared(path: Path) -> PreparedScene:
         raise InputError(f"{path} cannot be read ({error}); delete it to have the scene prepared again.") from error
 
 
-def simulate_run(folder: Path, token: str, run: Run, expected: str) -> dict[str, Any]:
-    """Simulate a run, or go on with it, and return what the manifest says of it when it is complete. `expected`: the
-    hash of its frames, where the manifest already has one."""
+def simulate_run(folder: Path, token: str, run: Run) -> dict[str, Any]:
+    """Simulate a run, or go on with it, and return what the manifest says of it when it is complete."""
     session = session_of(token)
     # Read when OpenMM creates its first Context: one thread per replica.
     os.environ["OPENMM_CPU_THREADS"] = "1"
@@ -152,19 +151,13 @@ def simulate_run(folder: Path, token: str, run: Run, expected: str) -> dict[str,
         session.frames.pop(run.name, None)
     with open_trajectory(out) as reader:
         record, n_frames = dict(reader.record), reader.n_frames
-    digest = frames_sha256(out)
-    if expected and digest != expected:
-        raise InputError(
-            f"{out} is not what this campaign once wrote there (its frames differ from {MANIFEST_NAME}); delete it to "
-            "have the run made again."
-        )
     # The PDB is for other programs: a run without it is whole.
     files = [path for path in (out, *companions(out)) if path.is_file() and path != topology_path(out)]
     return {
         "n_frames": n_frames,
         "size_bytes": out.stat().st_size,
         "sha256": {path.relative_to(folder).as_posix(): file_sha256(path) for path in files},
-        "frames_sha256": digest,
+        "frames_sha256": frames_sha256(out),
         "platform": record.get("platform", ""),
         "programs": {"python": platform.python_version(), **record.get("program", {})},
         "host": socket.gethostname(),

@@ -32,26 +32,14 @@ _TIMED_S, _BATCH_S = 0.3, 0.02
 
 @dataclass(frozen=True)
 class Plan:
-    """A run before it starts, in one `line` and in parts; what was not measured is None.
+    """A run before it starts, in one `line` and in `rows`; what was not measured is None.
 
     `wall_s`: seconds for all replicas of the asked length, equilibration included, if the cores are free. `skipped`:
     what a general MD program would do and this run does not, and why, or what it saves.
     """
 
     line: str
-
-    scene: str
-    formula: str
-    n_atoms: int
-    force_field: str
-    solvent: str
-    integrator: str
-    platform: str
-    platform_reason: str
-    threads: int
-    parallel: str
-    hydrogen_mass: str
-    constraints: str
+    rows: dict[str, str | int]
     us_per_step: float | None
     ns_per_day: float | None
     wall_s: float | None
@@ -90,20 +78,23 @@ def make_plan(scene: Scene, config: MDConfig, *, replicas: int = 1, timed: bool 
     elif replicas > 1:
         parallel = f"{replicas} replicas, {side_by_side} side by side, one process and {threads} each"
     heavy = spec.hydrogen_mass_da
+    rows: dict[str, str | int] = {
+        "scene": scene.name,
+        "formula": scene.formula,
+        "n_atoms": scene.n_atoms,
+        "force_field": spec.force_field,
+        "solvent": spec.solvent,
+        "integrator": _integrator(config),
+        "platform": choice.name,
+        "platform_reason": choice.reason,
+        "threads": choice.threads,
+        "parallel": parallel,
+        "hydrogen_mass": "natural" if heavy is None else f"{heavy:g} Da, taken from the atom it is bonded to",
+        "constraints": f"{n_constraints} bonds to hydrogen" if n_constraints else "none",
+    }
     return Plan(
         line=plan_line(scene, config, choice, step_s=planned, replicas=replicas),
-        scene=scene.name,
-        formula=scene.formula,
-        n_atoms=scene.n_atoms,
-        force_field=spec.force_field,
-        solvent=spec.solvent,
-        integrator=_integrator(config),
-        platform=choice.name,
-        platform_reason=choice.reason,
-        threads=choice.threads,
-        parallel=parallel,
-        hydrogen_mass="natural" if heavy is None else f"{heavy:g} Da, taken from the atom it is bonded to",
-        constraints=f"{n_constraints} bonds to hydrogen" if n_constraints else "none",
+        rows=rows,
         us_per_step=None if planned is None else planned * 1e6,
         ns_per_day=None if planned is None else _ns_per_day(config, planned),
         wall_s=_wall_s(config, replicas, planned),

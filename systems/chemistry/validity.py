@@ -11,7 +11,7 @@ from typing import Annotated, Any
 import numpy as np
 import numpy.typing as npt
 
-from systems.chemistry.geometry import column_blocks, cross, signed_volume, squared_distance, torsion_cosine
+from systems.chemistry.geometry import bond_angle, column_blocks, cross, signed_volume, squared_distance, torsion_cosine
 from systems.errors import InputError
 from systems.files.schema import Recorded
 from systems.scene import Scene
@@ -430,13 +430,6 @@ class Limits(Recorded):
     jump_min_nm: float = 0.0
     drift_max_nm: float = 0.0
 
-    @cached_property
-    def angle_cosines(self) -> tuple[FloatArray, FloatArray]:
-        """The least and the greatest cosine of each angle, `(k,)` each."""
-        least = np.where(self.angle_max_rad < np.pi, np.cos(self.angle_max_rad), -2.0)
-        greatest = np.where(self.angle_min_rad > 0.0, np.cos(self.angle_min_rad), 2.0)
-        return least, greatest
-
 
 def limits_from_frames(scene: Scene, positions_nm: npt.ArrayLike, next_nm: npt.ArrayLike) -> Limits:
     """Return the limits that reference frames `(n_frames, n_atoms, 3)` nm set; frame k is followed by `next_nm[k]`.
@@ -453,7 +446,7 @@ def limits_from_frames(scene: Scene, positions_nm: npt.ArrayLike, next_nm: npt.A
     angle_idx = np.array(triples, dtype=np.int64).reshape(-1, 3)
     quads = [(i, *around) for i, around in enumerate(near) if len(around) == 3]
     centres = np.array(quads, dtype=np.int64).reshape(-1, 4)
-    angles = np.arccos(np.clip(_gather(first, angle_idx, _angle_cosine), -1.0, 1.0))
+    angles = _gather(first, angle_idx, bond_angle)
     heights = np.abs(_gather(first, centres, _height))
     flat = np.sqrt((heights**2).mean(axis=1)) < _FLAT_NM
     mean = angles.mean(axis=1)
@@ -480,14 +473,14 @@ def check_limits(positions_nm: npt.ArrayLike, limits: Limits, previous_nm: npt.A
     """
     positions, previous = np.asarray(positions_nm), np.asarray(previous_nm)
     flags = np.zeros(len(positions), dtype=np.uint16)
-    least, greatest = (bound[:, None] for bound in limits.angle_cosines)
+    least, greatest = limits.angle_min_rad[:, None], limits.angle_max_rad[:, None]
     atoms = np.unique(limits.jump_idx)
     widest = max(len(limits.angle_idx), len(limits.flat_idx), len(limits.jump_idx))
     with np.errstate(invalid="ignore", over="ignore", divide="ignore"):
         for start, before, columns in _both(previous, positions, widest):
             part = flags[start : start + columns.shape[2]]
-            cosine = _angle_cosine(columns, limits.angle_idx)
-            part |= np.uint16(ANGLE) * ~((cosine >= least) & (cosine <= greatest)).all(axis=0)
+            angle = bond_angle(columns, limits.angle_idx)
+            part |= np.uint16(ANGLE) * ~((angle >= least) & (angle <= greatest)).all(axis=0)
             height = np.abs(_height(columns, limits.flat_idx))
             part |= np.uint16(PLANARITY) * ~(height <= limits.flat_max_nm[:, None]).all(axis=0)
             if len(atoms):
@@ -517,14 +510,6 @@ def _gather(frames: FloatArray, rows: IntArray, measure: Any) -> FloatArray:
 def _both(first: FloatArray, second: FloatArray, widest: int) -> Iterator[tuple[int, FloatArray, FloatArray]]:
     blocks = zip(column_blocks(first, widest), column_blocks(second, widest), strict=True)
     yield from ((start, a, b) for (start, a), (_, b) in blocks)
-
-
-def _angle_cosine(columns: FloatArray, triples: IntArray) -> FloatArray:
-    left = columns[:, triples[:, 0]] - columns[:, triples[:, 1]]
-    right = columns[:, triples[:, 2]] - columns[:, triples[:, 1]]
-    scale = np.sqrt((left * left).sum(axis=0) * (right * right).sum(axis=0))
-    cosine: FloatArray = (left * right).sum(axis=0) / np.maximum(scale, np.finfo(columns.dtype).tiny)
-    return cosine
 
 
 def _height(columns: FloatArray, quads: IntArray) -> FloatArray:

@@ -96,5 +96,5 @@ def test_what_simd_cannot_do_is_refused(tmp_path: Path, change: dict[str, object
 
 def test_the_plan_counts_replicas_that_run_at_once() -> None:
     one, many = (make_plan(SCENE, CONFIG, replicas=n) for n in (1, 16))
-    assert many.platform == "simd" and one.us_per_step is not None and many.us_per_step is not None
+    assert many.rows["platform"] == "simd" and one.us_per_step is not None and many.us_per_step is not None
     assert 8 < one.us_per_step / many.us_per_step < 32

@@ -23,8 +23,8 @@ def skipped(scene: Scene, spec: ForceFieldSpec) -> set[str]:
 def test_terms_and_constraints_are_those_of_the_molecule(alanine_dipeptide: Scene) -> None:
     plan = make_plan(alanine_dipeptide, MDConfig(time_ps=0.0), timed=False)
     n_hydrogen = alanine_dipeptide.elements.count("H")
-    assert plan.constraints == f"{n_hydrogen} bonds to hydrogen"
-    assert plan.platform == "Reference"
+    assert plan.rows["constraints"] == f"{n_hydrogen} bonds to hydrogen"
+    assert plan.rows["platform"] == "Reference"
     assert plan.us_per_step is None
     json.dumps(asdict(plan))
 
@@ -45,7 +45,7 @@ def test_a_long_step_with_natural_hydrogens_is_warned_of(alanine_dipeptide: Scen
 
 
 def test_the_platform_asked_for_is_kept_or_refused(alanine_dipeptide: Scene) -> None:
-    assert make_plan(alanine_dipeptide, MDConfig(time_ps=0.0, platform="CPU"), timed=False).platform == "CPU"
+    assert make_plan(alanine_dipeptide, MDConfig(time_ps=0.0, platform="CPU"), timed=False).rows["platform"] == "CPU"
     with pytest.raises(UnknownNameError, match="Reference"):
         make_plan(alanine_dipeptide, MDConfig(time_ps=0.0, platform="Referense"), timed=False)
 
