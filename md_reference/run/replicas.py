@@ -26,12 +26,9 @@ from md_reference.run.starts import many_starts
 from md_reference.simd.force_field import SimdReplicas, n_replicas
 from systems.errors import InputError, SimulationError, SurromdError
 from systems.interrupts import deferred_interrupt, end_with_parent
-from systems.scene import Scene
+from systems.scene import FloatArray, Scene
 from systems.trajectory.base import TrajectoryWriter
-from systems.trajectory.checkpoint import Checkpoint, checkpoint_path, locked_outputs, supported_checkpoint, writer_at
-
-# Frames are computed for about so long, then written and checkpointed.
-_BLOCK_S = 2.0
+from systems.trajectory.checkpoint import checkpoint_path, locked_outputs, supported_checkpoint, writer_at
 
 
 def simulate_batch(
@@ -65,8 +62,8 @@ def simulate_batch(
                 already_complete(out, config)
             return
         kept = supported_checkpoint(state_path, list(outs)) if resume and state_path.exists() else None
-        batch = _Batch(scene, config, outs, kept, overwrite=overwrite)
-        batch.start(starts_nm, asked_to_stop, progress)
+        batch = _Batch(scene, config, outs, kept, overwrite=overwrite, asked_to_stop=asked_to_stop, progress=progress)
+        batch.start(starts_nm)
         record = record_of(scene, config, simd_choice())
         with ExitStack() as stack:
             writers = []
@@ -74,93 +71,64 @@ def simulate_batch(
                 own = {**record, "replica": k, "of_replicas": len(outs), **(notes[k] if notes else {})}
                 writer = writer_at(out, batch.written, own, batch.header, k, resumed=batch.resumed)
                 writers.append(stack.enter_context(writer))
-            batch.produce(writers, asked_to_stop, progress)
+            batch.produce(writers)
         state_path.unlink(missing_ok=True)
 
 
 class _Batch(StoredRun):
     """Replicas in the vector registers of one core."""
 
-    def __init__(
-        self, scene: Scene, config: MDConfig, outs: Sequence[Path], kept: Checkpoint | None, *, overwrite: bool
-    ) -> None:
-        super().__init__(scene, config, outs, kept, overwrite=overwrite)
-        self.system = build_system(scene, config.force)
-        bath: dict[str, Any] = {"temperature_k": config.temperature_k, "friction_per_ps": config.friction_per_ps}
-        self.simd = SimdReplicas(self.system, **bath, timestep_ps=config.timestep_ps, seed=config.seed)
+    block_s = 2.0
+    others = " and each other file of this batch"
 
-    def start(
-        self, starts_nm: npt.NDArray[np.floating] | None, asked_to_stop: Callable[[], bool],
-        progress: ProgressFn | None,
-    ) -> None:  # fmt: skip
+    def start(self, starts_nm: npt.NDArray[np.floating] | None) -> None:
         """Go to where the batch was left, or to the starts, and equilibrate. Raises SimulationError."""
+        config, system = self.config, build_system(self.scene, self.config.force)
+        bath: dict[str, Any] = {"temperature_k": config.temperature_k, "friction_per_ps": config.friction_per_ps}
+        self.simd = SimdReplicas(system, **bath, timestep_ps=config.timestep_ps, seed=config.seed)
+        self.n_dof = self.simd.n_dof
         if self.resumed:
             self.simd.restore(self.blob)
             return
-        report_preparing(progress, 0.0)
+        report_preparing(self.progress, 0.0)
         if starts_nm is None:
             # The Reference platform has no neighbour lists.
             platform = "Reference" if self.scene.cell_nm is None else "CPU"
-            with Engine(self.scene, replace(self.config, platform=platform), system=self.system) as engine:
+            with Engine(self.scene, replace(config, platform=platform), system=system) as engine:
                 engine.minimise()
                 starts_nm = engine.positions()[None]
                 refuse_damaged(self.scene, starts_nm[0])
-        self.simd.check(self.system, starts_nm[0])
+        self.simd.check(system, starts_nm[0])
         # Replicas left over repeat the last start; they cost nothing and are not kept.
         self.simd.set_positions(starts_nm[np.minimum(np.arange(self.simd.n_replicas), len(starts_nm) - 1)])
         self.simd.thermalise()
-        n_steps = math.ceil(round(self.config.equilibrate_ps / self.config.timestep_ps, 6))
+        n_steps = math.ceil(round(config.equilibrate_ps / config.timestep_ps, 6))
         piece = max(1, min(1000, n_steps))
         for done in range(0, n_steps, piece):
-            if asked_to_stop():
+            if self.asked_to_stop():
                 raise KeyboardInterrupt
             self.simd.step(min(piece, n_steps - done))
-            report_preparing(progress, min(1.0, (done + piece) / n_steps))
+            report_preparing(self.progress, min(1.0, (done + piece) / n_steps))
         self.save()
 
     def save(self) -> None:
         self.keep(self.simd.checkpoint(), platform=SIMD)
 
-    def produce(
-        self, writers: Sequence[TrajectoryWriter], asked_to_stop: Callable[[], bool], progress: ProgressFn | None
-    ) -> None:
-        """Append frames until all are there. Raises SimulationError, StorageError, KeyboardInterrupt."""
-        config, n = self.config, len(writers)
-        while self.done < config.n_frames:
-            frames, failure = self._frames(asked_to_stop)
-            if frames:
-                positions, energies, temperatures = (np.stack(x, axis=1) for x in zip(*frames, strict=True))
-                cell = self.scene.cell_nm
-                cells = None if cell is None else np.repeat(cell[None], len(frames), axis=0)
-                times = (self.done + 1 + np.arange(len(frames))) * config.save_every_ps
-                for k, writer in enumerate(writers):
-                    scalars = {"potential_kj_mol": energies[k], "temperature_k": temperatures[k]}
-                    writer.append(positions[k], times, scalars=scalars, cell_nm=cells)
-                self.written_so_far(writers, len(frames))
-            where = f"{self.outs[0]} and each other file of this batch."
-            self.refuse_failed(failure, writers, where)
-            if self.done < config.n_frames:
-                self.save()
-            if progress is not None:
-                progress(n * self.done, n * config.n_frames)
-            if asked_to_stop() and self.done < config.n_frames:
-                self.stop(writers)
-        self.finish(writers, self.simd.n_dof)
+    def frame(self) -> tuple[npt.NDArray[np.float32], FloatArray, FloatArray] | None:
+        """Return positions, energies and temperatures of all replicas."""
+        if self.asked_to_stop():
+            return None
+        self.simd.step(self.config.steps_per_frame)
+        positions = self.simd.positions_nm[:, self.atoms].astype(np.float32)
+        return positions, self.simd.energies(), self.simd.temperatures_k()
 
-    def _frames(self, asked_to_stop: Callable[[], bool]) -> tuple[list[tuple[Any, Any, Any]], str]:
-        """Return the frames of the next seconds, each positions, energies and temperatures of all replicas."""
-        found: list[tuple[Any, Any, Any]] = []
-        until = time.monotonic() + _BLOCK_S
-        while self.done + len(found) < self.config.n_frames and not (found and time.monotonic() > until):
-            if asked_to_stop() and found:
-                break
-            try:
-                self.simd.step(self.config.steps_per_frame)
-            except SimulationError as error:
-                return found, str(error)
-            positions = self.simd.positions_nm[:, self.atoms].astype(np.float32)
-            found.append((positions, self.simd.energies(), self.simd.temperatures_k()))
-        return found, ""
+    def append(self, writers: Sequence[TrajectoryWriter], frames: Sequence[Any], times_ps: npt.ArrayLike) -> None:
+        positions, energies, temperatures = (np.stack(x, axis=1) for x in zip(*frames, strict=True))
+        cell = self.scene.cell_nm
+        cells = None if cell is None else np.repeat(cell[None], len(frames), axis=0)
+        for k, writer in enumerate(writers):
+            scalars = {"potential_kj_mol": energies[k], "temperature_k": temperatures[k]}
+            writer.append(positions[k], times_ps, scalars=scalars, cell_nm=cells)
 
 
 # ---- processes ------------------------------------------------------------------------------------------------------

@@ -49,7 +49,7 @@ def test_replicas_differ_and_say_how_they_were_made(tmp_path: Path) -> None:
 def test_what_was_stopped_goes_on_as_if_it_had_not_been(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     whole, parts = [tmp_path / "w0.h5", tmp_path / "w1.h5"], [tmp_path / "p0.h5", tmp_path / "p1.h5"]
     simulate_batch(SCENE, CONFIG, whole)
-    monkeypatch.setattr(replicas, "_BLOCK_S", 0.0)
+    monkeypatch.setattr(replicas._Batch, "block_s", 0.0)
 
     def stop(done: int, total: int, note: str | None = None) -> None:
         if note is None and done >= 6:
