@@ -20,7 +20,6 @@ from md_reference.forces.forcefield import build_system, resolve
 from md_reference.forces.solvation import require_molecules, solvate
 from md_reference.forces.spec import ForceFieldSpec, WaterBox
 from md_reference.run.config import MDConfig
-from md_reference.run.machine import PlatformChoice, platform_for
 from md_reference.run.simulate import simulate
 from md_reference.run.starts import many_starts
 from systems.chemistry.graph import molecule_key
@@ -39,12 +38,11 @@ T = TypeVar("T")
 
 @dataclass(frozen=True)
 class PreparedScene:
-    """What replicas share: the scene, the force field resolved for it, and the platform they run on; where each begins,
-    `(n_atoms, 3)` nm, as far as that is known, how it was found, and the seed of that."""
+    """What replicas share: the scene and the force field resolved for it; where each begins, `(n_atoms, 3)` nm, as far
+    as that is known, how it was found, and the seed of that."""
 
     scene: Scene
     force: ForceFieldSpec
-    platform: PlatformChoice
     starts_nm: tuple[tuple[tuple[float, ...], ...], ...] = ()
     started: str = ""
     seed: int = 0
@@ -65,7 +63,6 @@ class PreparedScene:
             "formula": self.scene.formula,
             "topology_hash": self.scene.topology_hash,
             "molecule_key": molecule_key(self.scene),
-            "platform": self.platform.name,
             "force": asdict(self.force),
             "starts": self.started,
             "repairs": tuple(map(str, repairs)) if isinstance(repairs, list | tuple) else (),
@@ -85,8 +82,8 @@ def prepare_scene(folder: Path, spec: SceneSpec, config: MDConfig, seed: int, re
 
 
 def _prepare(path: Path, spec: SceneSpec, config: MDConfig, seed: int, replicas: int) -> PreparedScene:
-    """Write and return the scene, solvated where the solvent is made of molecules, its platform chosen, starts of its
-    replicas drawn; its forces are built, so that replicas find parameters that take long in the cache."""
+    """Write and return the scene, solvated where the solvent is made of molecules, starts of its replicas drawn; its
+    forces are built, so that replicas find parameters that take long in the cache."""
     scene = prepare(spec.source, options=_chosen(Preparation, spec))
     force = resolve(scene, config.force)
     if spec.preparation.get("keep_water"):
@@ -94,8 +91,7 @@ def _prepare(path: Path, spec: SceneSpec, config: MDConfig, seed: int, replicas:
     if force.is_explicit and scene.cell_nm is None:
         scene = solvate(scene, force, _chosen(WaterBox, spec), seed=seed, temperature_k=config.temperature_k)
     build_system(scene, force)
-    choice = platform_for(scene, replace(config, force=force))
-    prepared = PreparedScene(replace(scene, name=spec.name), force, choice, seed=seed)
+    prepared = PreparedScene(replace(scene, name=spec.name), force, seed=seed)
     if replicas > 1 and config.starts == "many":
         starts = many_starts(prepared.scene, replace(config, force=force, seed=seed), replicas)
         frames = tuple(s.positions_nm.tolist() for s in starts.scenes)
@@ -103,7 +99,6 @@ def _prepare(path: Path, spec: SceneSpec, config: MDConfig, seed: int, replicas:
     record = {
         "scene": prepared.scene.to_dict(),
         "force": asdict(force),
-        "platform": asdict(prepared.platform),
         "starts_nm": prepared.starts_nm,
         "started": prepared.started,
         "seed": seed,
@@ -121,10 +116,10 @@ def _chosen(kind: type[T], spec: SceneSpec) -> T:
 def load_prepared(path: Path) -> PreparedScene:
     """Read what `prepare_scene` wrote. Raises InputError when it cannot be read."""
     try:
-        record = parsed(content(path))
-        record["platform"].pop("timings", None)  # of an earlier version
+        record = dict(parsed(content(path)))
+        record.pop("platform", None)  # of an earlier version
         return built(PreparedScene, record)
-    except (OSError, ValueError, LookupError, TypeError, AttributeError) as error:
+    except (OSError, ValueError, TypeError) as error:
         raise InputError(f"{path} cannot be read ({error}); delete it to have the scene prepared again.") from error
 
 
@@ -146,7 +141,7 @@ def simulate_run(folder: Path, token: str, run: Run) -> dict[str, Any]:
     start, config = prepared.start_of(run.replica, run.config), replace(run.config, force=prepared.force)
     session.frames[run.name] = 0
     try:
-        simulate(start, config, out, resume=True, progress=report, choice=prepared.platform)
+        simulate(start, config, out, resume=True, progress=report)
     finally:
         session.frames.pop(run.name, None)
     with open_trajectory(out) as reader:

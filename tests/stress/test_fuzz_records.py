@@ -20,7 +20,6 @@ from md_reference.campaign.manifest import campaign_trajectories, read_manifest,
 from md_reference.campaign.scheduler import check_same_campaign, new_manifest
 from md_reference.campaign.worker import PreparedScene, load_prepared
 from md_reference.forces.forcefield import ForceFieldSpec, build_system
-from md_reference.run.machine import PlatformChoice
 from md_reference.run.simulate import MDConfig, simulate
 from surrogate import api
 from surrogate.cli.render import print_pairs
@@ -129,9 +128,8 @@ def manifest_kind(folder: Path) -> Kind:
 
 def prepared_kind(folder: Path, scene: Scene) -> Kind:
     path = folder / "a.json"
-    prepared = PreparedScene(scene, ForceFieldSpec(), PlatformChoice("Reference", 1, "asked for"))
-    record = json.loads(json_text({"scene": scene.to_dict(), "force": vars(prepared.force),
-                                   "platform": vars(prepared.platform)}, "scene"))  # fmt: skip
+    prepared = PreparedScene(scene, ForceFieldSpec())
+    record = json.loads(json_text({"scene": scene.to_dict(), "force": vars(prepared.force)}, "scene"))
 
     def read() -> None:
         found = load_prepared(path)
