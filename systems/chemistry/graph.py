@@ -63,7 +63,7 @@ def classify(scene: Scene, *, stereo: bool = True, mirrored: bool = False) -> At
     Bond orders and atomic charges are left out: programs differ in them for one and the same molecule.
     """
     graph = bonded_graph(scene)
-    rings = _ring_sizes(graph)
+    rings = ring_sizes(graph)
     neighbours = scene.neighbours()
     labels = {(i, j): rings.get((min(i, j), max(i, j)), 0) for i in range(scene.n_atoms) for j in neighbours[i]}
     colours = _refine([_hash(e, len(n)) for e, n in zip(scene.elements, neighbours, strict=True)], neighbours, labels)
@@ -156,19 +156,14 @@ def _cis_trans(positions_nm: FloatArray, neighbours: list[list[int]], colours: l
     return "cis" if abs(angle) < np.pi / 2 else "trans"
 
 
-def _ring_sizes(graph: nx.Graph) -> dict[tuple[int, int], int]:
-    """Size of the smallest ring through each ring bond (i < j); larger ones than `_LARGEST_RING` count as that + 1."""
+def ring_sizes(graph: nx.Graph) -> dict[tuple[int, int], int]:
+    """Return the size of the smallest ring through each ring bond (i < j); 13 for all larger ones."""
     acyclic = {(min(e), max(e)) for e in nx.bridges(graph)}
     sizes = {}
     for i, j in ((min(e), max(e)) for e in graph.edges):
-        if (i, j) in acyclic:
-            continue
-        front, seen, size = {i}, {i}, 1
-        while front and j not in seen and size <= _LARGEST_RING:
-            front = {k for f in front for k in graph[f] if k not in seen and {f, k} != {i, j}}
-            seen |= front
-            size += 1
-        sizes[i, j] = size
+        if (i, j) not in acyclic:
+            others = nx.restricted_view(graph, [], [(i, j)])
+            sizes[i, j] = min(nx.shortest_path_length(others, i, j) + 1, _LARGEST_RING + 1)
     return sizes
 
 

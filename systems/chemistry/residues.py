@@ -14,6 +14,10 @@ from functools import cache
 from importlib.resources import files
 from typing import cast
 
+import networkx as nx
+
+from systems.chemistry.graph import ring_sizes
+
 # The least numbers of hydrogens that differ from what the dictionary leaves a residue at the highest pH: a lone charge
 # may be drawn on either nitrogen, sulfur may be bridged.
 _FEWEST_HYDROGENS = {"ARG": {"NH1": 1, "NH2": 1}, "CYS": {"SG": 0}, "HIS": {"NE2": 0}, "LYS": {"NZ": 2}}
@@ -232,7 +236,7 @@ def _ionise(
 ) -> None:
     """Add to and take from the hydrogens of titratable groups."""
     symbol = residue.elements
-    ring = _ring_bonds(residue)
+    ring = ring_sizes(nx.Graph([(i, j) for i, j, _ in residue.bonds]))
     acid_protons: dict[int, int] = {}
     for k, element in enumerate(symbol):
         if element == "O" and counts[k] and len(near[k]) == 1:
@@ -255,25 +259,12 @@ def _ionise(
                 others = [n for n, _ in near[j] if symbol[n] == "N" and n != k]
                 if order != 2 or symbol[j] != "C" or not others:
                     continue
-                in_ring = frozenset((j, k)) in ring
+                bond = min(j, k), max(j, k)
+                in_ring = bond in ring
                 if residue.charges[k] == 0 and not in_ring:  # guanidine, amidine
                     counts[k] += ph < _PKA_GUANIDINE
-                elif residue.charges[k] == 1 and in_ring and ring[frozenset((j, k))] == 5 and counts[k]:
+                elif residue.charges[k] == 1 and in_ring and ring[bond] == 5 and counts[k]:
                     counts[k] -= ph > _PKA_IMIDAZOLE
-
-
-def _ring_bonds(residue: Component) -> dict[frozenset[int], int]:
-    """Return the bonds in rings, with the size of the smallest ring found about each."""
-    import networkx as nx
-
-    graph: nx.Graph = nx.Graph([(i, j) for i, j, _ in residue.bonds])
-    out: dict[frozenset[int], int] = {}
-    for cycle in nx.minimum_cycle_basis(graph):
-        members = set(cycle)
-        for i, j, _ in residue.bonds:
-            if {i, j} <= members:
-                out[frozenset((i, j))] = min(len(cycle), out.get(frozenset((i, j)), len(cycle)))
-    return out
 
 
 @cache
