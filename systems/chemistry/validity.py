@@ -311,20 +311,15 @@ def _flat_ring_torsions(scene: Scene, mean_cosine: Callable[[IntArray], FloatArr
 def small_rings(scene: Scene, *, most_neighbours: int | None = None) -> list[list[int]]:
     """Return the rings of 4 to 7 atoms, atoms in order: the smallest ring of each bond. `most_neighbours` leaves out
     rings with an atom of more neighbours."""
+    import networkx as nx
+
     from systems.chemistry.graph import bonded_graph, ring_bonds
 
     graph = bonded_graph(scene)
     rings: dict[frozenset[int], list[int]] = {}
     for i, j in ring_bonds(scene).tolist():
-        before = {i: i}
-        layer = [i]
-        for _ in range(6):  # breadth first from i to j without the bond itself
-            layer = [
-                step
-                for atom in layer
-                for step in graph[atom]
-                if {atom, step} != {i, j} and step not in before and before.setdefault(step, atom) == atom
-            ]
+        without_bond = nx.restricted_view(graph, [], [(i, j)])
+        before = dict(nx.bfs_predecessors(without_bond, i, depth_limit=6))
         if j in before:
             ring = [j]
             while ring[-1] != i:
