@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import permutations
@@ -492,24 +493,16 @@ def _match_skeletons(ours: _Side, theirs: _Side, check_planar: bool) -> dict[int
 
 def _walk(side: _Side) -> list[tuple[int, int | None]]:
     """Atoms but terminal hydrogens in breadth-first order, rare classes first, each with its parent."""
-    kept = [i for i in range(len(side.near)) if i not in side.leaves]
-    count: dict[int, int] = {}
-    for i in kept:
-        count[side.colours[i]] = count.get(side.colours[i], 0) + 1
-    out: list[tuple[int, int | None]] = []
-    seen: set[int] = set()
+    kept = nx.Graph()
+    kept.add_nodes_from(i for i in range(len(side.near)) if i not in side.leaves)
+    kept.add_edges_from((i, j) for i in list(kept) for j in side.near[i] if j not in side.leaves)
+    count = Counter(side.colours[i] for i in kept)
+    parents: dict[int, int | None] = {}
     for start in sorted(kept, key=lambda i: (count[side.colours[i]], i)):
-        if start in seen:
-            continue
-        queue: list[tuple[int, int | None]] = [(start, None)]
-        seen.add(start)
-        for atom, parent in queue:
-            out.append((atom, parent))
-            for j in side.near[atom]:
-                if j not in seen and j not in side.leaves:
-                    seen.add(j)
-                    queue.append((j, atom))
-    return out
+        if start not in parents:
+            parents[start] = None
+            parents.update((atom, parent) for parent, atom in nx.bfs_edges(kept, start))
+    return list(parents.items())
 
 
 def _checks(side: _Side, kept: set[int], check_planar: bool) -> Iterator[_Check]:
