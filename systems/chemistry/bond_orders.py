@@ -8,6 +8,8 @@ import networkx as nx
 import numpy as np
 import numpy.typing as npt
 
+from systems.chemistry.graph import ring_sizes
+
 # (valence, charge, penalty) by element and number of neighbours. As in antechamber's bond type perception (Wang, Wang,
 # Kollman and Case, J. Mol. Graph. Model. 2006, 25, 247) a penalty says how unusual a state is; here every state is
 # closed-shell and carries its formal charge. Carbon carries none: one that seems to be charged misses a hydrogen.
@@ -74,8 +76,8 @@ def lewis_structure(
     graph = nx.Graph(pairs)
     graph.add_nodes_from(range(len(elements)))
     neighbours = [sorted(graph[i]) for i in range(len(elements))]
-    rings = _oxonium_rings(elements, graph)
-    states = [_states(elements, graph, neighbours, i, rings, carbon_ions) for i in range(len(elements))]
+    rings, oxonium = ring_sizes(graph), _oxonium(elements, graph)
+    states = [_states(elements, neighbours, i, rings, oxonium, carbon_ions) for i in range(len(elements))]
     if not all(states):
         return None
     orders = np.ones(len(pairs))
@@ -101,21 +103,22 @@ def lewis_structure(
 
 def _states(
     elements: Sequence[str],
-    graph: nx.Graph,
     neighbours: Sequence[Sequence[int]],
     i: int,
-    rings: set[int],
+    rings: Mapping[tuple[int, int], int],
+    oxonium: set[int],
     carbon_ions: bool,
 ) -> tuple[_State, ...]:
     symbol, near = elements[i], neighbours[i]
     states = _ANY.get(symbol, {}).get(len(near), ())
     around = [(elements[j], len(neighbours[j])) for j in near]
-    if symbol == "C" and len(near) == 2 and _in_small_ring(graph, i):
+    sizes = {rings[bond] for j in near if (bond := (min(i, j), max(i, j))) in rings}
+    if symbol == "C" and len(near) == 2 and min(sizes, default=8) < 8:
         return ()  # as bent as no triple bond or cumulene is: a ring that misses a hydrogen
     if symbol == "C" and len(near) == 1 and around[0] in (("N", 1), ("N", 2), ("O", 1)):
         states = (_CYANIDE,)
     elif symbol == "C" and carbon_ions:
-        anion = _CYCLOPENTADIENIDE if len(near) == 3 and _in_five_ring(graph, i) else _CARBANION
+        anion = _CYCLOPENTADIENIDE if len(near) == 3 and 5 in sizes else _CARBANION
         states = (*states, anion, *((_CARBENIUM,) if len(near) == 3 else ()))
     elif symbol == "N" and len(near) == 2 and any(e != "H" and degree == 1 for e, degree in around):
         states = _MIDDLE
@@ -123,7 +126,7 @@ def _states(
         states = (*states, _AZIDE_END)
     elif symbol == "O" and around == [("O", 1)] * 2:
         states = (_OZONE,)
-    elif symbol == "O" and (i in rings or around == [("C", 1)]):
+    elif symbol == "O" and (i in oxonium or around == [("C", 1)]):
         states = (*states, _OXONIUM)
     return states
 
@@ -135,33 +138,13 @@ def _is_ylide(elements: Sequence[str], neighbours: Sequence[Sequence[int]], i: i
     )
 
 
-def _in_small_ring(graph: nx.Graph, i: int) -> bool:
-    """Whether an atom with two neighbours is in a ring of fewer than eight."""
-    a, b = graph[i]
-    near = nx.single_source_shortest_path_length(nx.restricted_view(graph, [i], []), a, cutoff=5)
-    return b in near
-
-
-def _in_five_ring(graph: nx.Graph, i: int) -> bool:
-    rest = nx.restricted_view(graph, [i], [])
-    reached = {j: nx.single_source_shortest_path_length(rest, j, cutoff=3) for j in graph[i]}
-    return any(reached[j].get(k) == 3 for j in graph[i] for k in graph[i])
-
-
-def _oxonium_rings(elements: Sequence[str], graph: nx.Graph) -> set[int]:
+def _oxonium(elements: Sequence[str], graph: nx.Graph) -> set[int]:
     """Oxygens of six-rings without a saturated member (pyrylium, flavylium), which may take a third bond."""
-    found: set[int] = set()
     flat = graph.subgraph(
         i for i in graph if (elements[i] in ("C", "N") and graph.degree(i) in (2, 3)) or
         (elements[i] == "O" and graph.degree(i) == 2)
     )  # fmt: skip
-    for i in flat:
-        if elements[i] == "O" and flat.degree(i) == 2:
-            a, b = flat[i]
-            rest = flat.subgraph(j for j in flat if j != i)
-            if nx.has_path(rest, a, b) and nx.shortest_path_length(rest, a, b) == 4:
-                found.add(i)
-    return found
+    return {i for bond, size in ring_sizes(flat).items() if size == 6 for i in bond if elements[i] == "O"}
 
 
 def _solve(
