@@ -15,6 +15,7 @@ from md_reference.forces.spec import ForceFieldSpec, WaterBox
 from md_reference.run.config import MDConfig, resolve_settings, to_config
 from systems.errors import InputError, SurromdError, nearest
 from systems.files.schema import built, fitted
+from systems.library.named_scenes import entry as library_entry
 from systems.library.named_scenes import find_protocol
 from systems.options import Preparation, options_of, read_toml
 from systems.units import quantity
@@ -198,9 +199,7 @@ def _scene_spec(head: _SceneHead, preparation: dict[str, Any], base: Path, where
             raise InputError(f"{where}no such file: {path}.")
         source, digest = str(path), file_sha256(path)
     else:
-        from systems.library import named_scenes
-
-        named_scenes.entry(source)  # an unknown name is refused now, with the nearest
+        library_entry(source)  # an unknown name is refused now, with the nearest
     if head.name and not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9._+-]{0,99}", head.name):
         raise InputError(f"{where}name = {head.name!r} must be letters, digits and . _ + - (it names files).")
     return SceneSpec(head.name or name_of(source), source, digest, preparation)

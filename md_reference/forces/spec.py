@@ -74,20 +74,17 @@ class ForceFieldSpec:
             if name not in known:
                 meant = nearest(name, list(known))
                 raise UnknownNameError(f"unknown {what} {name!r}; known: {', '.join(known)}.{meant}")
-        if self.solvent == "amber99-obc" and self.force_field != "ff99SB-ILDN":
-            raise PreparationError("solvent 'amber99-obc' goes with `force_field='ff99SB-ILDN'`; use obc2 otherwise.")
-        if self.solvent in QUANTUM_SOLVENTS and self.force_field != QUANTUM:
-            raise PreparationError(
-                f"solvent {self.solvent!r} goes with `level='{QUANTUM}'`; use obc2 or tip3p otherwise."
-            )
-        own = {QUANTUM: QUANTUM_SOLVENTS, MODEL: ()}.get(self.force_field, SOLVENTS)
+        only = {"amber99-obc": "ff99SB-ILDN", **dict.fromkeys(QUANTUM_SOLVENTS, QUANTUM)}.get(self.solvent)
+        if only and self.force_field != only:
+            raise PreparationError(f"solvent {self.solvent!r} goes with {only} alone; use obc2 or tip3p otherwise.")
+        own = {QUANTUM: QUANTUM_SOLVENTS, MODEL: (), "charmm36": ("obc2", "gbn2", "tip3p")}.get(
+            self.force_field, SOLVENTS
+        )
         if self.solvent not in (*own, "vacuum", "auto"):
             instead = "".join(f"{name}, " for name in own)
             raise PreparationError(
                 f"{self.force_field} has no solvent {self.solvent!r}; give {instead}vacuum, or leave `solvent` out."
             )
-        if self.force_field == "charmm36" and self.solvent == "opc":
-            raise PreparationError("charmm36 has no parameters for OPC water and its ions; use `solvent='tip3p'`.")
 
     @staticmethod
     def of(record: Mapping[str, Any]) -> ForceFieldSpec:
