@@ -128,10 +128,7 @@ def read_manifest(folder: Path) -> Manifest:
 
 def campaign_folder(path: Path) -> Path | None:
     """Return the campaign's folder that `path` is or lies in, or None."""
-    for folder in (path, *path.resolve().parents):
-        if (folder / MANIFEST_NAME).is_file():
-            return folder
-    return None
+    return next((folder for folder in (path, *path.resolve().parents) if (folder / MANIFEST_NAME).is_file()), None)
 
 
 def campaign_trajectories(path: Path, *, verify: bool = False) -> tuple[list[Path], int]:

@@ -191,11 +191,8 @@ def component(name: str) -> Component | None:
 
 def known_template(residue_name: str) -> ResidueTemplate | None:
     """Return the template of a standard residue, or that of a component of the dictionary, or None."""
-    standard = template_for(residue_name)
-    if standard is not None:
-        return standard
     found = component(residue_name)
-    return None if found is None else found.template
+    return template_for(residue_name) or (found.template if found else None)
 
 
 def hydrogens_of(
