@@ -36,7 +36,7 @@ _SPRINGS_GROUP = 31
 
 @dataclass(frozen=True)
 class State:
-    """Positions `(n_atoms, 3)` nm, energies in kJ/mol, time in ps, kinetic temperature in K.
+    """Positions `(n_atoms, 3)` nm, energies in kJ/mol, kinetic temperature in K.
 
     Where asked for: velocities `(n_atoms, 3)` nm/ps and forces `(n_atoms, 3)` kJ/mol/nm, without those of constraints.
     Box vectors `(3, 3)` nm in a periodic system.
@@ -45,7 +45,6 @@ class State:
     positions_nm: FloatArray
     potential_kj_mol: float
     kinetic_kj_mol: float
-    time_ps: float
     temperature_k: float
     velocities_nm_ps: FloatArray | None = None
     forces_kj_mol_nm: FloatArray | None = None
@@ -166,7 +165,7 @@ class Engine:
         self._context.setVelocities(velocities)
 
     def take_over(self, state: State) -> None:
-        """Take over cell, positions and velocities of another engine of this scene; the clock stays as it is."""
+        """Take over cell, positions and velocities of another engine of this scene."""
         if state.cell_nm is not None:
             self._context.setPeriodicBoxVectors(*np.asarray(state.cell_nm, dtype=np.float64).tolist())
         self.set_positions(state.positions_nm)
@@ -211,10 +210,6 @@ class Engine:
         if self._keeps_momentum:
             self.set_velocities(self._of_atoms(self._query(velocities=True).getVelocities(asNumpy=True)))
 
-    def reset_clock(self) -> None:
-        self._context.setTime(0.0)
-        self._context.setStepCount(0)
-
     def step(self, n_steps: int) -> None:
         """Integrate. Raises SimulationError when OpenMM itself notices that coordinates are no longer finite."""
         with _openmm_errors("integration failed"):
@@ -229,7 +224,7 @@ class Engine:
         return np.asarray(values._value, dtype=np.float64)[: self.scene.n_atoms]
 
     def state(self, *, velocities: bool = False, forces: bool = False) -> State:
-        """Return positions, energies, time and kinetic temperature, and what else is asked for.
+        """Return positions, energies and kinetic temperature, and what else is asked for.
 
         With a bath, velocities are those of half steps (Zhang et al., J. Phys. Chem. A 123, 6056 (2019)), and so is the
         temperature. Raises SimulationError for a state that is not finite, or hotter than the bath can make it
@@ -248,7 +243,6 @@ class Engine:
             positions_nm=self._of_atoms(raw.getPositions(asNumpy=True)),
             potential_kj_mol=float(raw.getPotentialEnergy()._value),
             kinetic_kj_mol=kinetic,
-            time_ps=float(raw.getTime()._value),
             temperature_k=2.0 * kinetic / (max(self.n_dof, 1) * GAS_CONSTANT_KJ_MOL_K),
             velocities_nm_ps=self._of_atoms(raw.getVelocities(asNumpy=True)) if velocities else None,
             forces_kj_mol_nm=self._of_atoms(raw.getForces(asNumpy=True)) if forces else None,

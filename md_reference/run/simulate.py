@@ -268,7 +268,6 @@ class _Run(StoredRun):
         try:
             self._equilibrate(bath)
             if config.ensemble != "nve":
-                bath.reset_clock()
                 return bath
             state = bath.state(velocities=True)
         except SimulationError as error:
