@@ -274,11 +274,6 @@ class Engine:
         self._context = None
 
 
-def integrator_name(ensemble: str) -> str:
-    """Return the name that records have for the integrator of an ensemble."""
-    return "VelocityVerlet" if ensemble == "nve" else "LangevinMiddle"
-
-
 def _velocity_verlet(timestep_ps: float, *, constrained: bool) -> Any:
     """Return velocity Verlet (Swope et al., J. Chem. Phys. 76, 637 (1982)), with RATTLE where bonds are constrained.
     Unlike those of OpenMM's VerletIntegrator, a leapfrog, its velocities belong to the same time as its positions."""

@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 from md_reference.forces.forcefield import build_system
 from md_reference.run.config import MDConfig, check_run, check_same_run, settings_of
-from md_reference.run.engine import Engine, State, integrator_name, refuse_damaged
+from md_reference.run.engine import Engine, State, refuse_damaged
 from md_reference.run.machine import PlatformChoice, platform_for
 from md_reference.run.run_summary import summarise
 from systems.errors import InputError, SimulationError
@@ -337,7 +337,7 @@ def record_of(scene: Scene, config: MDConfig, choice: PlatformChoice) -> dict[st
 
     return {
         "kind": "reference",
-        "integrator": integrator_name(config.ensemble),
+        "integrator": "VelocityVerlet" if config.ensemble == "nve" else "LangevinMiddle",
         "program": {"openmm": openmm.__version__},
         "started": datetime.now(UTC).isoformat(timespec="seconds"),
         "completed": False,
