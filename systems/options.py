@@ -1,9 +1,8 @@
-"""Options of the verbs, each declared once: a field of a frozen dataclass whose metadata says what it does.
+"""Options of the verbs, each declared once: a field of a frozen dataclass whose metadata says what it does. From it
+follow the command line, the Python call (`options_as_keywords`), the keys of a `config` file and the manual's tables.
 
-From that declaration follow the command line, the signature and the documentation of the Python call
-(`options_as_keywords`), the keys of a `config` file, their checks, and the manual's tables. A name ends in its unit
-(`time_ps`), which the command line and files leave out: there a value carries it (`time = "10ns"`). Imports no library,
-so that the command's help is quick.
+A name ends in its unit (`time_ps`), which the command line and files leave out: there a value carries it (`time =
+"10ns"`). Imports no library, so that the command's help is quick.
 """
 
 from __future__ import annotations
@@ -13,8 +12,8 @@ import inspect
 import textwrap
 import tomllib
 import types
-from collections.abc import Callable, Hashable, Mapping, Sequence
-from dataclasses import MISSING, dataclass, field, fields, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import MISSING, dataclass, field, fields
 from functools import cache
 from inspect import get_annotations
 from operator import attrgetter
@@ -23,7 +22,7 @@ from typing import Any, Literal, TypeVar, Union, cast, get_args, get_origin, get
 
 from systems.errors import InputError, UnknownNameError, nearest
 from systems.files.outside import content
-from systems.units import format_quantity, is_openmm_quantity, openmm_number, parser_of, quantity, stem_of, unit_of
+from systems.units import format_quantity, parser_of, quantity, stem_of, unit_of
 
 T = TypeVar("T")
 _KEY = "option"
@@ -38,19 +37,6 @@ class MissingOptionError(InputError):
         self.needs = f"needs {name}: {option.help}"
 
 
-@dataclass(frozen=True)
-class Declaration:
-    """What a field's metadata says of an option; see `option`."""
-
-    help: str
-    choices: tuple[str, ...]
-    within: tuple[float | None, float | None]
-    read: Callable[[str, str], Any] | None
-    unset: str
-    words: tuple[str, ...] | None
-    section: str
-
-
 def option(
     help: str,
     default: Any = MISSING,
@@ -62,17 +48,17 @@ def option(
     words: Sequence[str] | None = (),
     section: str = "",
 ) -> Any:
-    """Return a dataclass field that is an option.
+    """Return a dataclass field that is an option; without a `default` it must be given.
 
-    `help`: one sentence. Without a `default` it must be given. `choices`: the values that there are; `within`: bounds
-    of a number. `read(text, what)` returns the value of a text where the unit in the name does not say how. `unset`:
-    what the default comes to, for the help. `words`: how the command line calls it, where that is not its name without
-    the unit, and a letter for it; None keeps it off the command line. `section`: the table of a `config` file that it
-    stands in, which keeps it off the command line, too.
+    `help`: one sentence. `choices`: the values that there are; `within`: bounds of a number. `read(text, what)` returns
+    the value of a text where the unit in the name does not say how. `unset`: what the default comes to, for the help.
+    `words`: how the command line calls it, where that is not its name without the unit, and a letter for it; None keeps
+    it off the command line. `section`: the table of a `config` file that it stands in, which keeps it off the command
+    line, too.
     """
     words = None if words is None or section else tuple(words)
-    said = Declaration(help, tuple(choices), within, read, unset, words, section)
-    return field(default=default, metadata={_KEY: said})
+    said = {"help": help, "choices": tuple(choices), "within": within, "read": read, "unset": unset, "words": words}
+    return field(default=default, metadata={_KEY: {**said, "section": section}})
 
 
 def from_field(kind: type, name: str, default: Any = ..., *, unset: str = "") -> Any:
@@ -80,17 +66,23 @@ def from_field(kind: type, name: str, default: Any = ..., *, unset: str = "") ->
 
     With another `default`, None say, what the option comes to is what it is there, or `unset`.
     """
-    found: Declaration = cast(Any, kind).__dataclass_fields__[name].metadata[_KEY]
-    shown = options_of(kind)[name]
+    said, shown = cast(Any, kind).__dataclass_fields__[name].metadata[_KEY], options_of(kind)[name]
     if default is ...:
-        return field(default=shown.default, metadata={_KEY: found})
-    return field(default=default, metadata={_KEY: replace(found, unset=unset or shown.shown_default)})
+        return field(default=shown.default, metadata={_KEY: said})
+    return field(default=default, metadata={_KEY: {**said, "unset": unset or shown.shown_default}})
 
 
 @dataclass(frozen=True, kw_only=True)
-class Option(Declaration):
-    """An option of a dataclass: its declaration, and the field's name, type and default (MISSING: it must be given)."""
+class Option:
+    """An option of a dataclass: what `option` declares, and the field's name, type and default (MISSING: none)."""
 
+    help: str
+    choices: tuple[str, ...]
+    within: tuple[float | None, float | None]
+    read: Callable[[str, str], Any] | None
+    unset: str
+    words: tuple[str, ...] | None
+    section: str
     name: str
     hint: Any
     default: Any
@@ -150,9 +142,6 @@ class Option(Declaration):
     def value(self, given: Any, what: str) -> Any:
         """Return what is given for it, checked and in our unit. Raises UnitError, UnknownNameError or InputError, which
         call it `what`."""
-        if is_openmm_quantity(given):
-            given = openmm_number(self.name if self.unit else "", given, what)
-            given = given.tolist() if self.many and hasattr(given, "tolist") else given
         if hasattr(given, "item") and not getattr(given, "ndim", 1):
             given = given.item()
         if self.reader is not None and (given is not None or type(None) not in get_args(self.hint)):
@@ -167,6 +156,11 @@ class Option(Declaration):
                 raise InputError(f"{error}.") from None
         self.check(value, what)
         return value
+
+    def written(self, given: Any, what: str) -> Any:
+        """Return what a file gives for it; there a quantity carries its unit."""
+        bare = self.unit and isinstance(given, int | float) and not isinstance(given, bool)
+        return self.value(str(given) if bare else given, what)
 
     def _read(self, given: Any, what: str) -> Any:
         if given is None or given == self.default:
@@ -208,13 +202,12 @@ def options_of(kind: type) -> dict[str, Option]:
 
 
 @cache
-def _options_of(kind: Hashable) -> dict[str, Option]:
-    made = cast(Any, kind)
-    hints = get_type_hints(made)
-    declared = {f.name: f for f in fields(made) if _KEY in f.metadata}
-    order = dict.fromkeys(name for each in made.__mro__ for name in get_annotations(each) if name in declared)
+def _options_of(kind: Any) -> dict[str, Option]:
+    hints = get_type_hints(kind)
+    declared = {f.name: f for f in fields(kind) if _KEY in f.metadata}
+    order = dict.fromkeys(name for each in kind.__mro__ for name in get_annotations(each) if name in declared)
     return {
-        name: Option(**vars(declared[name].metadata[_KEY]), name=name, hint=hints[name], default=declared[name].default)
+        name: Option(**declared[name].metadata[_KEY], name=name, hint=hints[name], default=declared[name].default)
         for name in order
     }
 
@@ -267,8 +260,7 @@ def read_options(kind: type, file: str | Path) -> dict[str, Any]:
             name = keys.get(key.replace("-", "_"))
             if name is None:
                 raise InputError(f"{where}unknown key {key!r}.{_meant(key, section, known)}")
-            bare = known[name].unit and isinstance(value, int | float) and not isinstance(value, bool)
-            values[name] = known[name].value(str(value) if bare else value, f"{where}{key}")
+            values[name] = known[name].written(value, f"{where}{key}")
     return values
 
 
@@ -287,11 +279,7 @@ def part_of(settings: Any, kind: type[T]) -> T:
 
 
 def flag_of(name: str) -> str:
-    """Return how the command line calls an option of this name, where nothing else is declared.
-
-    >>> flag_of("save_every_ps") == "-" * 2 + "save-every"
-    True
-    """
+    """Return how the command line calls an option of this name, where nothing else is declared."""
     return f"--{stem_of(name).replace('_', '-')}"
 
 
@@ -305,9 +293,9 @@ def read_toml(path: str | Path) -> dict[str, Any]:
 
         return dict(parsed(content(Path(path)).decode(), tomllib.loads))
     except FileNotFoundError:
-        raise InputError(f"configuration {path} does not exist.") from None
+        raise InputError(f"{path} does not exist.") from None
     except (OSError, ValueError) as error:
-        raise InputError(f"configuration {path} is not valid TOML: {error}.") from error
+        raise InputError(f"{path} is not valid TOML: {error}.") from error
 
 
 # ---- functions that take options ------------------------------------------------------------------------------------
@@ -317,12 +305,11 @@ R = TypeVar("R")
 
 
 def options_as_keywords(kind: type) -> Callable[[Callable[..., R]], Callable[..., R]]:
-    """Let a function whose last parameter is `options`, a dataclass `kind`, be called with these options as keywords.
+    """Let a function whose last parameter is `options`, a dataclass `kind`, be called with these options as keywords,
+    which its signature lists and its documentation explains.
 
-    Its signature lists them one by one, as an editor or `help` shows it, and its documentation says what each does.
-    `options=` takes the dataclass itself, `config=` the path of a TOML file; keywords come before both. A quantity is a
-    number in the unit that its name ends in, or a text with its own. Any other keyword is a TypeError, as always, which
-    names the nearest.
+    `options=` takes the dataclass itself, `config=` the path of a TOML file; keywords come before both. Any other
+    keyword is a TypeError, as always, which names the nearest.
     """
     known = options_of(kind)
 

@@ -1,7 +1,5 @@
-"""Scene: one molecule or system as plain arrays, from which every library's own object is made on demand.
-
-Also parts of a scene, by number or in MDTraj's selection language, and a scene with its atoms in another order.
-"""
+"""Scene: one molecule or system as plain arrays, from which every library's own object is made on demand; parts of a
+scene, and a scene with its atoms in another order."""
 
 from __future__ import annotations
 
@@ -41,12 +39,10 @@ T = TypeVar("T")
 class Scene:
     """A molecular system: topology, starting positions and where they came from.
 
-    Shapes: per atom `(n_atoms,)`, bonds `(n_bonds, 2)` with i < j, positions `(n_atoms, 3)` in nm, masses in dalton,
-    formal charges in elementary charges. `bond_orders` holds 1, 1.5, 2, 3, or 0 where the source does not say.
-    `residue_of_atom` indexes `residue_names`, `residue_ids` and `chain_of_residue`.
-
-    `cell_nm`: reduced box vectors `(3, 3)` of a periodic system, else None. `interactions`: the law of a model system
-    as JSON-able values with a key `kind`; None where a force field says what the forces are.
+    Per atom `(n_atoms,)`, bonds `(n_bonds, 2)` with i < j, positions `(n_atoms, 3)` in nm, masses in dalton, formal
+    charges in elementary charges. `bond_orders`: 1, 1.5, 2, 3, or 0 where the source does not say. `residue_of_atom`
+    indexes `residue_names`, `residue_ids` and `chain_of_residue`. `cell_nm`: reduced box vectors `(3, 3)` of a periodic
+    system. `interactions`: the law of a model system as JSON-able values with a key `kind`, else None.
     """
 
     name: str
@@ -184,11 +180,9 @@ def neighbours_of(bonds: IntArray, n_atoms: int) -> list[list[int]]:
 
 
 def once_per_scene(function: Callable[Concatenate[Scene, P], T]) -> Callable[Concatenate[Scene, P], T]:
-    """Return `function` so that it computes what it says of a Scene once, for as long as that object lives.
-
-    A Scene never changes, so neither does what follows from it. All callers share the result, which must not be
-    changed: arrays are made read-only here, graphs are to be frozen. Further arguments must be hashable.
-    """
+    """Return `function` so that it computes what it says of a Scene, which never changes, once for as long as that
+    object lives. All callers share the result: arrays are made read-only here, graphs are to be frozen. Further
+    arguments must be hashable."""
     known: weakref.WeakKeyDictionary[Scene, dict[Any, T]] = weakref.WeakKeyDictionary()
 
     @functools.wraps(function)

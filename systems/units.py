@@ -5,7 +5,6 @@ from __future__ import annotations
 import functools
 import math
 import re
-import sys
 from collections.abc import Callable
 from numbers import Real
 from typing import Any, NamedTuple, overload
@@ -15,8 +14,7 @@ from systems.errors import UnitError
 GAS_CONSTANT_KJ_MOL_K = 8.31446261815324e-3
 # Minus the logarithm of how often chance may be taken for a blow-up.
 _UNLIKELINESS = 50.0
-# What a verb takes for a quantity: a number in the unit that the name ends in, or a text with its own: `10ns`; also a
-# quantity of `openmm.unit`, which is not named here, for this package imports no simulator.
+# What a verb takes for a quantity: a number in the unit that the name ends in, or a text with its own: `10ns`.
 Quantity = float | str
 
 # Both signs for micro: U+00B5, which keyboards type, and U+03BC, which other programs print.
@@ -27,15 +25,13 @@ _NUMBER = re.compile(r"^\s*([-+]?[0-9.]+(?:[eE][-+]?[0-9]+)?)\s*(\S*)\s*$")
 class _Dimension(NamedTuple):
     """The units that a text may have, with what each is in ours; where a bare number means ours, "" is among them.
 
-    `shown`: our unit; `what`, `example`: how messages call such a quantity, and write one; `openmm`: our unit as
-    `openmm.unit` calls it, with its power; `may_be_zero`: whether a text may say so.
+    `shown`: our unit; `what`, `example`: how messages call such a quantity, and write one; `may_be_zero`: as it says.
     """
 
     units: dict[str, float]
     shown: str
     what: str
     example: str
-    openmm: tuple[str, int]
     may_be_zero: bool = False
 
 
@@ -44,19 +40,17 @@ DIMENSIONS = {
     # "1/ps" is the number 1 with the unit "/ps", while "1 1/ps" spells the unit out.
     "_per_ps": _Dimension(
         {"/ps": 1.0, "1/ps": 1.0, "ps^-1": 1.0, "/fs": 1e3, "1/fs": 1e3, "/ns": 1e-3, "1/ns": 1e-3, "": 1.0},
-        "1/ps", "friction", "1/ps", ("picosecond", -1),
+        "1/ps", "friction", "1/ps",
     ),
-    "_ps": _Dimension(_TIME_PS, "ps", "time", "10ns", ("picosecond", 1)),
-    "_k": _Dimension({"K": 1.0, "": 1.0}, "K", "temperature", "300K", ("kelvin", 1)),
-    "_da": _Dimension({"Da": 1.0, "u": 1.0, "amu": 1.0, "": 1.0}, "Da", "hydrogen mass", "3Da", ("dalton", 1)),
-    "_nm": _Dimension(
-        {"nm": 1.0, "A": 0.1, "Å": 0.1, "angstrom": 0.1, "pm": 1e-3}, "nm", "length", "1nm", ("nanometer", 1)
-    ),
+    "_ps": _Dimension(_TIME_PS, "ps", "time", "10ns"),
+    "_k": _Dimension({"K": 1.0, "": 1.0}, "K", "temperature", "300K"),
+    "_da": _Dimension({"Da": 1.0, "u": 1.0, "amu": 1.0, "": 1.0}, "Da", "hydrogen mass", "3Da"),
+    "_nm": _Dimension({"nm": 1.0, "A": 0.1, "Å": 0.1, "angstrom": 0.1, "pm": 1e-3}, "nm", "length", "1nm"),
     "_molar": _Dimension(
-        {"M": 1.0, "mM": 1e-3, "mol/l": 1.0, "mol/L": 1.0, "": 1.0}, "M", "concentration", "0.15M", ("molar", 1), True
+        {"M": 1.0, "mM": 1e-3, "mol/l": 1.0, "mol/L": 1.0, "": 1.0}, "M", "concentration", "0.15M", True
     ),
-    "_bar": _Dimension({"bar": 1.0, "atm": 1.01325, "": 1.0}, "bar", "pressure", "1bar", ("bar", 1)),
-    "_s": _Dimension({"s": 1.0, "min": 60.0, "h": 3600.0}, "s", "budget", "30min", ("second", 1)),
+    "_bar": _Dimension({"bar": 1.0, "atm": 1.01325, "": 1.0}, "bar", "pressure", "1bar"),
+    "_s": _Dimension({"s": 1.0, "min": 60.0, "h": 3600.0}, "s", "budget", "30min"),
 }  # fmt: skip
 
 
@@ -120,30 +114,6 @@ def stem_of(name: str) -> str:
     return name.removesuffix(_ending(name))
 
 
-def is_openmm_quantity(value: Any) -> bool:
-    """Whether this is a quantity of `openmm.unit`, told without importing OpenMM."""
-    return hasattr(value, "value_in_unit") and hasattr(value, "unit")
-
-
-def openmm_number(name: str, value: Any, what: str = "") -> Any:
-    """Return what a quantity of `openmm.unit` is in the unit that the name ends in.
-
-    Raises UnitError for another dimension, and for a setting whose name ends in no unit.
-    """
-    what, ending = what or name, _ending(name)
-    if not ending:
-        raise UnitError(f"{what} = {value} has a unit, and takes none.")
-    # Whoever holds a quantity has imported its module.
-    units = sys.modules[type(value).__module__.rpartition(".")[0]]
-    unit, power = DIMENSIONS[ending].openmm
-    try:
-        return value.value_in_unit(getattr(units, unit) ** power)
-    except TypeError:
-        raise UnitError(
-            f"{what} = {value} cannot be turned into {unit_of(name)}; give a quantity of that dimension."
-        ) from None
-
-
 @overload
 def quantity(name: str, value: Quantity, what: str = ...) -> float: ...
 @overload
@@ -151,17 +121,15 @@ def quantity(name: str, value: None, what: str = ...) -> None: ...
 def quantity(name: str, value: Any, what: str = "") -> float | None:
     """Return what a setting called `name` (`time_ps`) is in the unit that its name ends in.
 
-    `value` is a number in that unit, a text with its own, such as '10ns', or a quantity of `openmm.unit`; None stays
-    None. `what`: how messages call it, by default as it is called. Raises UnitError for another kind of value, and for
-    a number that is negative or not finite.
+    `value` is a number in that unit, or a text with its own, such as '10ns'; None stays None. `what`: how messages call
+    it, by default as it is called. Raises UnitError for another kind of value, and for a number that is negative or not
+    finite.
     """
     if value is None:
         return None
     what = what or name
     if isinstance(value, str):
         return parser_of(name)(value, what)
-    if is_openmm_quantity(value):
-        value = openmm_number(name, value, what)
     if isinstance(value, bool) or not isinstance(value, Real):
         raise UnitError(f"{what} = {value!r} must be a number in {unit_of(name)}, or a text with its unit.")
     number = float(value)

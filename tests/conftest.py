@@ -15,8 +15,6 @@ if TYPE_CHECKING:
 # Before any numerical library is loaded: the arrays are small, and more threads only make them wait for each other.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 os.environ.setdefault("MPLBACKEND", "Agg")
-# Platforms by size: nothing is timed, nothing in the user's cache is read or written. Tests of the timing switch it on.
-os.environ["SURROMD_TIMING"] = "off"
 
 # A shell starts background jobs with Ctrl-C ignored, nohup with hang-ups, and what tests start would inherit that.
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:

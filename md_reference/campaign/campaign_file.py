@@ -3,34 +3,27 @@
 from __future__ import annotations
 
 import re
-import tomllib
 from collections.abc import Iterable
-from dataclasses import MISSING, Field, dataclass, field, fields, replace
+from dataclasses import dataclass, fields, replace
 from glob import glob
 from hashlib import sha256
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeVar, cast, get_args, get_type_hints
+from typing import Annotated, Any, Literal, TypeVar, cast
 
 from md_reference.campaign.manifest import file_sha256
 from md_reference.forces.spec import ForceFieldSpec, WaterBox
-from md_reference.run.config import MDConfig, resolve_by_name, to_config
+from md_reference.run.config import MDConfig, resolve_settings, to_config
 from systems.errors import InputError, SurromdError, nearest
-from systems.files.outside import content
-from systems.files.schema import built, fitted, parsed
+from systems.files.schema import built, fitted
+from systems.library.named_scenes import entry as library_entry
 from systems.library.named_scenes import find_protocol
-from systems.options import Preparation, options_of
-from systems.units import parse_wall_s, parser_of, quantity
+from systems.options import Preparation, options_of, read_toml
+from systems.units import quantity
 
 T = TypeVar("T")
 SCENE_FILES = (".pdb", ".ent", ".cif", ".mmcif", ".gz", ".sdf", ".mol", ".mol2")
-# Folder of the batch system's logs, inside the campaign's.
-JOB_LOGS = "jobs"
 _LONGEST_NAME, _MOST_RUNS = 40, 100_000
 _SEEDS = 2**31
-# Settings whose names end so are written without it, as texts with a unit.
-_ENDINGS = ("_per_ps", "_ps", "_k", "_da")
-# These belong to a run's place in the campaign.
-_NOT_SETTINGS = ("seed", "force")
 
 
 @dataclass(frozen=True)
@@ -55,44 +48,21 @@ class Run:
 
 
 @dataclass(frozen=True)
-class ClusterSpec:
-    """What is asked of a batch system, through dask-jobqueue: `jobs` jobs at most, each with `cores` runs at a time.
-
-    `interface`: the network interface on which scheduler and workers talk. Of the kinds, which are those that
-    dask-jobqueue knows, `local` starts the same jobs as processes here, to try a file out.
-    """
-
-    kind: Literal["slurm", "pbs", "sge", "lsf", "htcondor", "moab", "oar", "local"]
-    jobs: Annotated[int, range(1, 10_000)] = 1
-    cores: Annotated[int, range(1, 10_000)] = 1
-    memory: str = "2GB"
-    walltime: str = ""
-    queue: str = ""
-    account: str = ""
-    interface: str = ""
-    python: str = ""
-    directives: tuple[str, ...] = ()
-    prologue: tuple[str, ...] = ()
-
-
-@dataclass(frozen=True)
 class Campaign:
     """Everything a campaign's file says, with every run spelled out."""
 
     name: str
+    file: Path
     folder: Path
     seed: int
     scenes: tuple[SceneSpec, ...]
     runs: tuple[Run, ...]
     retries: int = 2
-    checkpoint_every_s: float = 20.0
-    cluster: ClusterSpec | None = None
-    text: str = field(default="", compare=False)
 
 
 @dataclass(frozen=True)
 class Settings:
-    """What one table says: fields of MDConfig and ForceFieldSpec by name, switches of `prepare`, and the axes."""
+    """What one table says: fields of MDConfig and ForceFieldSpec by name, options of `prepare`, and the axes."""
 
     values: dict[str, Any]
     preparation: dict[str, Any]
@@ -109,8 +79,6 @@ class _Head:
     format: Literal["h5", "dcd", "xtc"] = "h5"
     seed: Annotated[int, range(2**63)] = 0
     retries: Annotated[int, range(1000)] = 2
-    checkpoint_every: str = "20s"
-    cluster: ClusterSpec | None = None
 
 
 @dataclass(frozen=True)
@@ -128,15 +96,9 @@ def read_campaign(path: str | Path, *, folder: str | Path | None = None) -> Camp
     values of the wrong kind, scenes named twice, and settings that no run can have.
     """
     path = Path(path)
+    table = read_toml(path)
     try:
-        text = content(path).decode()
-        table = parsed(text, tomllib.loads)
-    except FileNotFoundError:
-        raise InputError(f"{path}: no such file.") from None
-    except (OSError, ValueError) as error:
-        raise InputError(f"{path} cannot be read as TOML: {error}.") from error
-    try:
-        return _campaign(table, path, text, None if folder is None else Path(folder))
+        return _campaign(table, path, None if folder is None else Path(folder))
     except (ValueError, InputError) as error:
         said = f"{error}." if isinstance(error, ValueError) else str(error)
         raise InputError(said if str(path) in said else f"{path}: {said}") from error
@@ -144,11 +106,12 @@ def read_campaign(path: str | Path, *, folder: str | Path | None = None) -> Camp
 
 # What a table says of its runs beside their settings.
 _AXES = {"replicas": Annotated[int, range(1, _MOST_RUNS + 1)], "temperatures": tuple[float | str, ...], "protocol": str}
-# How a scene is made: a campaign takes what the command line takes.
+# How a scene is made, and how a run goes, by their keys in a file: what the command line takes.
 _PREPARATION = options_of(Preparation) | options_of(WaterBox)
+SETTINGS = {each.key: each for kind in (MDConfig, ForceFieldSpec) for each in options_of(kind).values()}
 
 
-def _campaign(table: dict[str, Any], path: Path, text: str, folder: Path | None) -> Campaign:
+def _campaign(table: dict[str, Any], path: Path, folder: Path | None) -> Campaign:
     if not table.get("scenes"):
         raise InputError("name the scenes: scenes = ['alanine-dipeptide', ...], or a [[scenes]] table for each.")
     head, shared = _read(_Head, table, "")
@@ -175,9 +138,7 @@ def _campaign(table: dict[str, Any], path: Path, text: str, folder: Path | None)
         scenes=tuple(scenes),
         runs=tuple(runs),
         retries=head.retries,
-        checkpoint_every_s=parse_wall_s(head.checkpoint_every, "checkpoint_every"),
-        cluster=head.cluster,
-        text=text,
+        file=path,
     )
 
 
@@ -188,47 +149,21 @@ def _read(kind: type[T], table: dict[str, Any], where: str) -> tuple[T, Settings
     return built(kind, {key: value for key, value in table.items() if key in own}, where), settings
 
 
-def _known_fields() -> dict[str, Field[Any]]:
-    return {f.name: f for kind in (MDConfig, ForceFieldSpec) for f in fields(kind) if f.name not in _NOT_SETTINGS}
-
-
-def key_of(name: str) -> str:
-    """Return the key in a file of a field: `timestep` of `timestep_ps`."""
-    return next((name.removesuffix(ending) for ending in _ENDINGS if name.endswith(ending)), name)
-
-
 def read_settings(table: dict[str, Any], *, others: Iterable[str] = (), where: str = "") -> Settings:
-    """Return a table's settings, in our units. Raises InputError for a key that is unknown (with the nearest that is
-    known; `others` are keys the caller has read), ValueError for values of the wrong kind."""
-    hints = get_type_hints(MDConfig) | get_type_hints(ForceFieldSpec)
-    by_key = {key_of(name): name for name in _known_fields()}
+    """Return a table's settings, in our units. Raises InputError for a key that is unknown (with the nearest; `others`
+    are keys the caller has read), and InputError or ValueError for values of the wrong kind."""
     found = Settings({}, {}, {})
     for key, value in table.items():
         if key in _AXES:
             found.axes[key] = fitted(value, _AXES[key], f"{where}{key}")
         elif key in _PREPARATION:
             found.preparation[key] = _PREPARATION[key].value(value, f"{where}{key}")
-        elif key in by_key:
-            name = by_key[key]
-            found.values[name] = _value(name, hints[name], value, f"{where}{key}")
+        elif key in SETTINGS:
+            found.values[SETTINGS[key].name] = SETTINGS[key].written(value, f"{where}{key}")
         else:
-            meant = nearest(key, [*by_key, *_PREPARATION, *_AXES, *others])
+            meant = nearest(key, [*SETTINGS, *_PREPARATION, *_AXES, *others])
             raise InputError(f"{where}unknown key {key!r}.{meant}")
     return found
-
-
-def _value(name: str, hint: Any, value: Any, where: str) -> Any:
-    if type(None) in get_args(hint) and value in ("natural", "none"):
-        return None
-    if name.endswith(_ENDINGS):
-        return parser_of(name)(str(fitted(value, float | str, where)), where)
-    return fitted(value, hint, where)
-
-
-def default_of(name: str) -> Any:
-    """Return the default of a setting, or None where it has none."""
-    known = _known_fields().get(name)
-    return None if known is None or known.default is MISSING else known.default
 
 
 def _scene_tables(head: _Head, base: Path) -> list[dict[str, Any]]:
@@ -264,9 +199,7 @@ def _scene_spec(head: _SceneHead, preparation: dict[str, Any], base: Path, where
             raise InputError(f"{where}no such file: {path}.")
         source, digest = str(path), file_sha256(path)
     else:
-        from systems.library import named_scenes
-
-        named_scenes.entry(source)  # an unknown name is refused now, with the nearest
+        library_entry(source)  # an unknown name is refused now, with the nearest
     if head.name and not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9._+-]{0,99}", head.name):
         raise InputError(f"{where}name = {head.name!r} must be letters, digits and . _ + - (it names files).")
     return SceneSpec(head.name or name_of(source), source, digest, preparation)
@@ -292,7 +225,7 @@ def _runs_of(spec: SceneSpec, shared: Settings, own: Settings, head: _Head) -> l
     shared, protocol = _by_protocol(shared, own)
     # Nobody trains on the water of a hundred runs.
     given = {"keep": "solute", **shared.values, **own.values}
-    values, _ = resolve_by_name("" if _kind(spec.source) else spec.source, given, protocol)
+    values, _ = resolve_settings("" if _kind(spec.source) else spec.source, given, protocol)
     axes = {**shared.axes, **own.axes}
     # A single temperature of the scene's own outweighs the campaign's list.
     if "temperature_k" in own.values and "temperatures" not in own.axes:

@@ -1,14 +1,12 @@
-"""Dask for campaigns: workers of this machine, of a scheduler that runs already or of a batch system; and the sessions
-by which a worker's tasks report how far they are, and stop when the command that started them is gone."""
+"""Dask for campaigns: workers of this machine or of a scheduler that runs already; and the sessions by which a worker's
+tasks report how far they are, and stop when the command that started them is gone."""
 
 from __future__ import annotations
 
-import importlib
 import logging
 import os
 import signal
 import socket
-import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -17,7 +15,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from md_reference.campaign.campaign_file import JOB_LOGS, ClusterSpec
 from md_reference.forces.programs import scratch_folder
 from systems.errors import InputError, SimulationError, StorageError, SurromdError
 from systems.interrupts import deferred_interrupt, stop_if_asked, stop_when
@@ -27,27 +24,18 @@ LEASE_S = 60.0
 _ONE_THREAD = {"OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "OPENMM_CPU_THREADS": "1"}
 # Dask listens for browsers in any case: where nobody does, and at no port that another asks for.
 _NO_PAGE = "127.0.0.1:0"
-_NO_PAGES = {"DASK_DISTRIBUTED__WORKER__HTTP__ROUTES": "[]"}
 # So long a scheduler may take to answer.
 _ANSWER_S = 20.0
 
 
 @contextmanager
-def open_client(
-    *,
-    workers: int | None = None,
-    scheduler: str | None = None,
-    cluster: ClusterSpec | None = None,
-    retries: int = 2,
-    folder: Path = Path(),
-) -> Iterator[Any]:
+def open_client(*, workers: int | None = None, scheduler: str | None = None, retries: int = 2) -> Iterator[Any]:
     """Yield a `distributed.Client` and close what was started for it. An interruption waits until all is started.
 
-    `scheduler` (tls://host:port, or tcp:// if its owner wants no lock) goes before `cluster`, and both before local
-    workers, one thread each (`workers`, as many as there are cores by default). Who can reach a scheduler runs code as
-    its user, so what is started here talks by TLS with a certificate of its own, which nobody else has, on one network
-    interface, local workers on the loopback, and shows no status page. Raises InputError when no scheduler answers or
-    dask-jobqueue is not installed.
+    `scheduler` (tls://host:port, or tcp:// if its owner wants no lock) goes before local workers, one thread each
+    (`workers`, as many as there are cores by default). Who can reach a scheduler runs code as its user, so what is
+    started here talks by TLS with a certificate of its own, which nobody else has, on the loopback, and shows no status
+    page. Raises InputError when no scheduler answers.
     """
     if workers is not None and scheduler is not None:
         raise InputError("`workers` starts workers here, `scheduler` uses those that are there; give one of them.")
@@ -59,7 +47,7 @@ def open_client(
     no_pages: dict[str, list[str]] = {f"distributed.{part}.http.routes": [] for part in ("worker", "scheduler")}
     with ExitStack() as stack:
         # What matters of Dask's messages stands in the campaign's own summary.
-        for logger in map(logging.getLogger, ("distributed", "tornado", "asyncio", "dask_jobqueue")):
+        for logger in map(logging.getLogger, ("distributed", "tornado", "asyncio")):
             stack.callback(logger.setLevel, logger.level)
             logger.setLevel(logging.CRITICAL)
         stack.enter_context(dask.config.set({"distributed.scheduler.allowed-failures": retries, **no_pages}))
@@ -69,15 +57,10 @@ def open_client(
             except (OSError, ValueError) as error:
                 raise InputError(f"no Dask scheduler answers at {scheduler} ({error}).") from error
         else:
-            if cluster is None:
-                scratch = stack.enter_context(scratch_folder("surromd-dask-"))
-                stack.enter_context(dask.config.set({"temporary-directory": str(scratch)}))
+            scratch = stack.enter_context(scratch_folder("surromd-dask-"))
+            stack.enter_context(dask.config.set({"temporary-directory": str(scratch)}))
             with deferred_interrupt():  # Dask cannot be stopped while it starts
-                started = _local(workers or available_cores()) if cluster is None else job_cluster(cluster, folder)
-                stack.enter_context(started)
-                if cluster is not None:
-                    # Jobs end with their walltime: new ones are asked for as long as there is work.
-                    started.adapt(minimum_jobs=0, maximum_jobs=cluster.jobs, interval="5s")
+                started = stack.enter_context(_local(workers or available_cores()))
                 client = stack.enter_context(Client(started, set_as_default=False))
                 stop_if_asked()
         yield client
@@ -100,61 +83,6 @@ def _local(workers: int) -> Any:
         env=_ONE_THREAD,
         preload=[__name__],
     )
-
-
-def job_cluster(spec: ClusterSpec, folder: Path) -> Any:
-    """Return dask-jobqueue's cluster for the `[cluster]` table, without any job yet (`job_script()` shows one).
-
-    Each of its jobs holds `cores` worker processes of one thread. The certificate by which scheduler and workers know
-    each other lies in the folder of the jobs' logs, readable for this user alone, until the cluster is closed. Raises
-    InputError where dask-jobqueue is not installed or refuses an entry.
-    """
-    on_ctrl_c = signal.getsignal(signal.SIGINT)
-    try:
-        # LocalCluster stands in its own module only.
-        module = importlib.import_module(f"dask_jobqueue.{spec.kind}")
-    except ImportError:
-        raise InputError("[cluster] needs dask-jobqueue: pip install 'surromd[cluster]'.") from None
-    finally:
-        # Importing dask-jobqueue makes Ctrl-C a silent success of the whole program.
-        if threading.current_thread() is threading.main_thread():
-            signal.signal(signal.SIGINT, on_ctrl_c)
-    from distributed import Security
-    from distributed.utils import get_ip
-
-    made = next(value for name, value in vars(module).items() if name.lower() == f"{spec.kind}cluster")
-    one_thread = [f"{name}={value}" for name, value in (_ONE_THREAD | _NO_PAGES).items()]
-    python, prologue = spec.python, [*(f"export {entry}" for entry in one_thread), *spec.prologue]
-    if spec.kind == "local":
-        # Its jobs are started without a shell: the command is all there can be.
-        if spec.prologue:
-            raise InputError("[cluster] local takes no prologue; what it holds must be done before surromd is started.")
-        python, prologue = " ".join(["env", *one_thread, spec.python or sys.executable]), []
-    logs = (folder / JOB_LOGS).resolve()
-    logs.mkdir(parents=True, exist_ok=True)
-    scheduler: dict[str, Any] = {"dashboard": False, "dashboard_address": _NO_PAGE}
-    if not spec.interface:
-        scheduler["host"] = "127.0.0.1" if spec.kind == "local" else get_ip()
-    given = {key: getattr(spec, key) for key in ("walltime", "queue", "account", "interface")} | {"python": python}
-    try:
-        return made(
-            protocol="tls://",
-            security=Security.temporary(),
-            shared_temp_directory=str(logs),
-            scheduler_options=scheduler,
-            cores=spec.cores,
-            processes=spec.cores,
-            memory=spec.memory,
-            job_extra_directives=list(spec.directives),
-            job_script_prologue=prologue,
-            worker_extra_args=["--preload", __name__, "--no-dashboard"],
-            log_directory=str(logs),
-            **{key: value for key, value in given.items() if value},
-        )
-    except (TypeError, ValueError) as error:
-        raise InputError(f"[cluster] {spec.kind} does not take this: {error}.") from error
-    except OSError as error:
-        raise SimulationError(f"[cluster] {spec.kind} cannot be started here: {error}.") from error
 
 
 @dataclass

@@ -49,8 +49,8 @@ class SceneEntry:
 class RunEntry:
     """One replica of one scene at one temperature; paths are relative to the campaign's folder.
 
-    `sha256` holds the hash of each file the run wrote; `frames_sha256` hashes what was simulated, without dates and
-    costs: it is the same for the same run on another day. `settings` are those the run was asked for, in our units.
+    `sha256`: of each file the run wrote; `frames_sha256`: of what was simulated, the same for the same run on another
+    day. `settings` are those the run was asked for, in our units.
     """
 
     name: str
@@ -128,10 +128,7 @@ def read_manifest(folder: Path) -> Manifest:
 
 def campaign_folder(path: Path) -> Path | None:
     """Return the campaign's folder that `path` is or lies in, or None."""
-    for folder in (path, *path.resolve().parents):
-        if (folder / MANIFEST_NAME).is_file():
-            return folder
-    return None
+    return next((folder for folder in (path, *path.resolve().parents) if (folder / MANIFEST_NAME).is_file()), None)
 
 
 def campaign_trajectories(path: Path, *, verify: bool = False) -> tuple[list[Path], int]:
@@ -150,14 +147,10 @@ def campaign_trajectories(path: Path, *, verify: bool = False) -> tuple[list[Pat
         raise InputError(f"{path}: none of the {len(entries)} runs of this campaign here is complete.")
     for name, expected in [item for run in complete for item in run.sha256.items()] if verify else ():
         file = folder / name
-        if not file.is_file():
+        if not file.is_file() or file_sha256(file) != expected:
             raise TrajectoryError(
-                f"{file} is gone, though {MANIFEST_NAME} lists it; run the campaign again to remake it."
-            )
-        if file_sha256(file) != expected:
-            raise TrajectoryError(
-                f"{file} is not the file that the campaign wrote (its sha256 differs from {MANIFEST_NAME}); delete it "
-                "and run the campaign again to remake it."
+                f"{file} is gone, or not the file that the campaign wrote (its sha256 differs from {MANIFEST_NAME}); "
+                "delete it and run the campaign again to remake it."
             )
     return [folder / run.file for run in complete], len(entries) - len(complete)
 

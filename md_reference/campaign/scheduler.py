@@ -1,8 +1,5 @@
-"""A campaign: many scenes, temperatures and replicas on Dask workers; whatever dies, what is left goes on.
-
-Every run is one task, and its state is its files: a task that starts again, on whichever worker, goes on from the run's
-checkpoint. `manifest.json` says what is done; it is written by this process alone.
-"""
+"""A campaign: many scenes, temperatures and replicas on Dask workers; whatever dies, what is left goes on from the
+files. `manifest.json`, written by this process alone, says what is done."""
 
 from __future__ import annotations
 
@@ -18,8 +15,8 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from md_reference.campaign.campaign_file import JOB_LOGS, Campaign, Run, SceneSpec, default_of, first_seed, key_of
-from md_reference.campaign.cluster import poll, result_of, stop
+from md_reference.campaign.campaign_file import Campaign, Run, SceneSpec, first_seed
+from md_reference.campaign.cluster import guarded, poll, result_of, stop
 from md_reference.campaign.manifest import (
     COMPLETE,
     FAILED,
@@ -32,7 +29,7 @@ from md_reference.campaign.manifest import (
     read_manifest,
     write_manifest,
 )
-from md_reference.run.config import settings_of
+from md_reference.run.config import MDConfig, settings_of
 from systems.errors import InputError, TrajectoryError
 from systems.files.whole_file import OutputLock
 from systems.interrupts import deferred_interrupt
@@ -80,9 +77,9 @@ def _new_entry(run: Run) -> RunEntry:
 def check_same_campaign(old: Manifest, new: Manifest, folder: Path) -> Manifest:
     """Return the manifest to go on with: what `old` has done, and what `new` asks for besides.
 
-    A campaign may grow (scenes, temperatures, replicas are added), never change: seeds and settings of every old run
-    must be those of the file. Raises InputError with the first key that differs. What is no longer as it was written
-    (a trajectory that is gone or of another size) waits again, and so does what failed.
+    A campaign may grow, never change: seeds and settings of every old run must be those of the file. What is no longer
+    as it was written (a trajectory that is gone or of another size) waits again, and so does what failed. Raises
+    InputError with the first key that differs.
     """
 
     def same(key: str, was: Any, now: Any) -> None:
@@ -97,27 +94,22 @@ def check_same_campaign(old: Manifest, new: Manifest, folder: Path) -> Manifest:
     for name, scene in old.scenes.items():
         same("scenes", name, name if name in scenes else "without it")
         asked = scenes[name]
-        if not scene.source_sha256 or scene.source_sha256 != asked.source_sha256:  # else the same file, moved
-            same(f"source of scene {name}", scene.source, asked.source)
-        same(f"source sha256 of scene {name}", scene.source_sha256, asked.source_sha256)
-        same(f"preparation of scene {name}", scene.preparation, asked.preparation)
+        is_moved = scene.source_sha256 and scene.source_sha256 == asked.source_sha256
+        for key in ("source_sha256", "preparation") if is_moved else ("source", "source_sha256", "preparation"):
+            same(f"{key} of scene {name}", getattr(scene, key), getattr(asked, key))
         scenes[name] = replace(scene, status=WAITING, reason="") if scene.status == FAILED else scene
+    # A setting that an older version did not know counts as its default.
+    defaults = settings_of(MDConfig(time_ps=0.0))
     for name, run in old.runs.items():
         if name not in runs:
-            is_replica = any((r.scene, r.temperature_k) == (run.scene, run.temperature_k) for r in new.runs.values())
-            axis = "replicas" if is_replica else "temperatures"
-            same(f"{axis} of scene {run.scene}", f"with {name}", "without it")
-        same("format", Path(run.file).suffix[1:], Path(runs[name].file).suffix[1:])
+            same(f"runs of scene {run.scene}", f"with {name}", "without it")
         same(f"file of {name}", run.file, runs[name].file)
         for key in {**run.settings, **runs[name].settings}:
-            was, now = (given.get(key, default_of(key)) for given in (run.settings, runs[name].settings))
-            same(f"{key_of(key)} of scene {run.scene} ({key})", was, now)
+            was, now = (given.get(key, defaults.get(key)) for given in (run.settings, runs[name].settings))
+            same(f"{key} of scene {run.scene}", was, now)
         file = folder / run.file
         if run.status != COMPLETE or not file.is_file() or file.stat().st_size != run.size_bytes:
-            # What is gone is made anew, and need not come out the same on another machine; what is there must be what
-            # it was.
-            kept = run.frames_sha256 if file.is_file() else ""
-            run = replace(run, status=WAITING, reason="", n_frames=0, frames_sha256=kept)
+            run = replace(run, status=WAITING, reason="", n_frames=0)
         runs[name] = run
     return replace(new, scenes=scenes, runs=runs, started=old.started)
 
@@ -134,11 +126,11 @@ def open_campaign(campaign: Campaign) -> Manifest:
         manifest = check_same_campaign(read_manifest(folder), manifest, folder)
     elif folder.is_file():
         raise InputError(f"{folder} is a file; name another folder (out = ..., or `out`).")
-    elif folder.is_dir() and any(not path.name.startswith(".") and path.name != JOB_LOGS for path in folder.iterdir()):
+    elif folder.is_dir() and any(not path.name.startswith(".") for path in folder.iterdir()):
         raise InputError(f"{folder} is not empty and no campaign's folder; name another (out = ..., or `out`).")
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        (folder / "campaign.toml").write_text(campaign.text, encoding="utf-8")
+        (folder / "campaign.toml").write_bytes(campaign.file.read_bytes())
     except OSError as error:
         raise InputError(f"{folder} cannot be made or written: {error.strerror}.") from error
     write_manifest(folder, manifest)
@@ -155,10 +147,10 @@ def run_campaign(
 ) -> Manifest:
     """Run what is not yet complete on a Dask client's workers and return the manifest, which is on disk.
 
-    `progress` is called several times a second with what the workers said when last asked. `failed(name, reason)` is
-    called when a scene or a run is given up: after `retries` further attempts, or at once where its input is at fault.
-    The others run on. Ctrl-C and SIGTERM stop the active runs between two frames, with checkpoints: KeyboardInterrupt
-    with a summary. Raises what `open_campaign` raises, and InputError when another process runs the same campaign.
+    `failed(name, reason)` is called when a scene or a run is given up: after `retries` further attempts, or at once
+    where its input is at fault. The others run on. Ctrl-C and SIGTERM stop the active runs between two frames, with
+    checkpoints: KeyboardInterrupt with a summary. Raises what `open_campaign` raises, and InputError when another
+    process runs the same campaign.
     """
     with _only_process(campaign.folder), deferred_interrupt() as asked_to_stop:
         job = _Job(campaign, client, open_campaign(campaign), failed or (lambda name, reason: None))
@@ -276,8 +268,7 @@ class _Job:
             own = ("prepare_scene", task, runs[0].config, seed, 1 + max(run.replica for run in runs))
             priority = 1 << 62
         else:
-            expected = self.manifest.runs[task.name].frames_sha256
-            own = ("simulate_run", task, self._campaign.checkpoint_every_s, expected)
+            own = ("simulate_run", self._token, task)
             n_steps = task.config.n_frames * task.config.steps_per_frame
             priority = (self.manifest.scenes[task.scene].n_atoms or 1) * n_steps
         future = self._client.submit(_work, self._token, self._folder, *own, key=key, priority=priority)
@@ -315,9 +306,8 @@ class _Job:
             if entries["status"] == COMPLETE:
                 self._submit(run)
             else:
-                self._note(
-                    self.manifest.runs, run.name, status=FAILED, reason=f"scene {task.name}: {entries['reason']}"
-                )
+                reason = f"scene {task.name}: {entries['reason']}"
+                self._note(self.manifest.runs, run.name, status=FAILED, reason=reason)
 
     def _note(self, table: dict[str, Any], name: str, **entries: Any) -> None:
         table[name] = replace(table[name], **entries)
@@ -326,25 +316,23 @@ class _Job:
 
 def _work(token: str, folder: Path, name: str, *given: Any) -> dict[str, Any]:
     """Do a task of `md_reference.campaign.worker`, which imports OpenMM: only workers do."""
-    from md_reference.campaign import worker
 
-    result: dict[str, Any] = getattr(worker, name)(token, folder, *given)
-    return result
+    def work() -> dict[str, Any]:
+        from md_reference.campaign import worker
+
+        result: dict[str, Any] = getattr(worker, name)(folder, *given)
+        return result
+
+    return guarded(token, folder / MANIFEST_NAME, work)
 
 
 @contextmanager
 def _only_process(folder: Path) -> Iterator[None]:
     """Hold the campaign's lock. Raises InputError when another process runs the campaign."""
-    existed = folder.exists()
     folder.mkdir(parents=True, exist_ok=True)
     try:
         lock = OutputLock(folder / MANIFEST_NAME)
     except TrajectoryError:
         raise InputError(f"{folder}: another process runs this campaign; wait for it, or stop it first.") from None
-    try:
-        with lock:
-            yield
-    finally:
-        if not existed and not (folder / MANIFEST_NAME).exists():
-            with suppress(OSError):
-                folder.rmdir()
+    with lock:
+        yield

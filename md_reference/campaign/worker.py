@@ -1,8 +1,5 @@
-"""Tasks of a campaign's workers: prepare a scene once, for all its replicas; simulate a run from wherever it stands.
-
-A run's file belongs to one task at a time (systems.files.whole_file), and a task stops by itself, with a checkpoint,
-when the campaign that started it has not been heard of for a minute.
-"""
+"""Tasks of a campaign's workers: prepare a scene once, for all its replicas; simulate a run from wherever it stands,
+until the campaign has not been heard of for a minute."""
 
 from __future__ import annotations
 
@@ -17,13 +14,12 @@ from typing import Any, TypeVar
 import numpy as np
 
 from md_reference.campaign.campaign_file import Run, SceneSpec
-from md_reference.campaign.cluster import LEASE_S, guarded, session_of
-from md_reference.campaign.manifest import MANIFEST_NAME, file_sha256, frames_sha256
+from md_reference.campaign.cluster import LEASE_S, session_of
+from md_reference.campaign.manifest import file_sha256, frames_sha256
 from md_reference.forces.forcefield import build_system, resolve
 from md_reference.forces.solvation import require_molecules, solvate
 from md_reference.forces.spec import ForceFieldSpec, WaterBox
 from md_reference.run.config import MDConfig
-from md_reference.run.machine import PlatformChoice, measured_platform
 from md_reference.run.simulate import simulate
 from md_reference.run.starts import many_starts
 from systems.chemistry.graph import molecule_key
@@ -42,12 +38,11 @@ T = TypeVar("T")
 
 @dataclass(frozen=True)
 class PreparedScene:
-    """What replicas share: the scene, the force field resolved for it, and the platform they run on; where each begins,
-    `(n_atoms, 3)` nm, as far as that is known, how it was found, and the seed of that."""
+    """What replicas share: the scene and the force field resolved for it; where each begins, `(n_atoms, 3)` nm, as far
+    as that is known, how it was found, and the seed of that."""
 
     scene: Scene
     force: ForceFieldSpec
-    platform: PlatformChoice
     starts_nm: tuple[tuple[tuple[float, ...], ...], ...] = ()
     started: str = ""
     seed: int = 0
@@ -68,7 +63,6 @@ class PreparedScene:
             "formula": self.scene.formula,
             "topology_hash": self.scene.topology_hash,
             "molecule_key": molecule_key(self.scene),
-            "platform": self.platform.name,
             "force": asdict(self.force),
             "starts": self.started,
             "repairs": tuple(map(str, repairs)) if isinstance(repairs, list | tuple) else (),
@@ -80,31 +74,24 @@ def scene_path(folder: Path, name: str) -> Path:
     return folder / "scenes" / f"{name}.json"
 
 
-def prepare_scene(
-    token: str, folder: Path, spec: SceneSpec, config: MDConfig, seed: int, replicas: int = 1
-) -> dict[str, Any]:
+def prepare_scene(folder: Path, spec: SceneSpec, config: MDConfig, seed: int, replicas: int = 1) -> dict[str, Any]:
     """Prepare a scene, or take the one that lies in `scenes/NAME.json`, and return its summary. `config`: of any of its
     runs, which share all but temperature and seed; `seed`: of the water around it; `replicas`: how many begin apart."""
     path = scene_path(folder, spec.name)
-
-    def prepared() -> PreparedScene:
-        return load_prepared(path) if path.is_file() else _prepare(path, spec, config, seed, replicas)
-
-    return guarded(token, folder / MANIFEST_NAME, lambda: prepared().summary())
+    return (load_prepared(path) if path.is_file() else _prepare(path, spec, config, seed, replicas)).summary()
 
 
 def _prepare(path: Path, spec: SceneSpec, config: MDConfig, seed: int, replicas: int) -> PreparedScene:
-    """Write and return the scene, solvated where the solvent is made of molecules, its platform chosen, starts of its
-    replicas drawn; its forces are built, so that replicas find parameters that take long in the cache."""
+    """Write and return the scene, solvated where the solvent is made of molecules, starts of its replicas drawn; its
+    forces are built, so that replicas find parameters that take long in the cache."""
     scene = prepare(spec.source, options=_chosen(Preparation, spec))
     force = resolve(scene, config.force)
     if spec.preparation.get("keep_water"):
         require_molecules(force)
     if force.is_explicit and scene.cell_nm is None:
         scene = solvate(scene, force, _chosen(WaterBox, spec), seed=seed, temperature_k=config.temperature_k)
-    system = build_system(scene, force)
-    choice = measured_platform(scene, replace(config, force=force), system=lambda: system)
-    prepared = PreparedScene(replace(scene, name=spec.name), force, replace(choice, timings=()), seed=seed)
+    build_system(scene, force)
+    prepared = PreparedScene(replace(scene, name=spec.name), force, seed=seed)
     if replicas > 1 and config.starts == "many":
         starts = many_starts(prepared.scene, replace(config, force=force, seed=seed), replicas)
         frames = tuple(s.positions_nm.tolist() for s in starts.scenes)
@@ -112,7 +99,6 @@ def _prepare(path: Path, spec: SceneSpec, config: MDConfig, seed: int, replicas:
     record = {
         "scene": prepared.scene.to_dict(),
         "force": asdict(force),
-        "platform": asdict(prepared.platform),
         "starts_nm": prepared.starts_nm,
         "started": prepared.started,
         "seed": seed,
@@ -130,18 +116,15 @@ def _chosen(kind: type[T], spec: SceneSpec) -> T:
 def load_prepared(path: Path) -> PreparedScene:
     """Read what `prepare_scene` wrote. Raises InputError when it cannot be read."""
     try:
-        return built(PreparedScene, parsed(content(path)))
-    except (OSError, ValueError) as error:
+        record = dict(parsed(content(path)))
+        record.pop("platform", None)  # of an earlier version
+        return built(PreparedScene, record)
+    except (OSError, ValueError, TypeError) as error:
         raise InputError(f"{path} cannot be read ({error}); delete it to have the scene prepared again.") from error
 
 
-def simulate_run(token: str, folder: Path, run: Run, checkpoint_every_s: float, expected: str) -> dict[str, Any]:
-    """Simulate a run, or go on with it, and return what the manifest says of it when it is complete. `expected`: the
-    hash of its frames, where the manifest already has one."""
-    return guarded(token, folder / MANIFEST_NAME, lambda: _simulate(token, folder, run, checkpoint_every_s, expected))
-
-
-def _simulate(token: str, folder: Path, run: Run, checkpoint_every_s: float, expected: str) -> dict[str, Any]:
+def simulate_run(folder: Path, token: str, run: Run) -> dict[str, Any]:
+    """Simulate a run, or go on with it, and return what the manifest says of it when it is complete."""
     session = session_of(token)
     # Read when OpenMM creates its first Context: one thread per replica.
     os.environ["OPENMM_CPU_THREADS"] = "1"
@@ -156,27 +139,20 @@ def _simulate(token: str, folder: Path, run: Run, checkpoint_every_s: float, exp
     # A worker that this one stands in for, cut off and not yet stopped, may still have the file.
     OutputLock(out, patience_s=2 * LEASE_S, stopped=session.should_stop).close()
     start, config = prepared.start_of(run.replica, run.config), replace(run.config, force=prepared.force)
-    how: dict[str, Any] = {"checkpoint_every_s": checkpoint_every_s, "choice": prepared.platform}
     session.frames[run.name] = 0
     try:
-        simulate(start, config, out, resume=True, progress=report, **how)
+        simulate(start, config, out, resume=True, progress=report)
     finally:
         session.frames.pop(run.name, None)
     with open_trajectory(out) as reader:
         record, n_frames = dict(reader.record), reader.n_frames
-    digest = frames_sha256(out)
-    if expected and digest != expected:
-        raise InputError(
-            f"{out} is not what this campaign once wrote there (its frames differ from {MANIFEST_NAME}); delete it to "
-            "have the run made again."
-        )
     # The PDB is for other programs: a run without it is whole.
     files = [path for path in (out, *companions(out)) if path.is_file() and path != topology_path(out)]
     return {
         "n_frames": n_frames,
         "size_bytes": out.stat().st_size,
         "sha256": {path.relative_to(folder).as_posix(): file_sha256(path) for path in files},
-        "frames_sha256": digest,
+        "frames_sha256": frames_sha256(out),
         "platform": record.get("platform", ""),
         "programs": {"python": platform.python_version(), **record.get("program", {})},
         "host": socket.gethostname(),

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from md_reference.forces.gaff import load_openmm, parameters
+from md_reference.forces import gaff
 from md_reference.forces.mixture import is_water, merge, molecules_of
 from md_reference.forces.nonstandard import build_chain, find_chain
 from md_reference.forces.quantum import build_quantum_system
@@ -54,15 +54,12 @@ def resolve(scene: Scene, spec: ForceFieldSpec) -> ForceFieldSpec:
 
     Force field: ff14SB where it covers every residue, gaff2 where it covers no molecule but water and ions,
     ff14SB+gaff2 where it covers some. Solvent: TIP3P where the scene has a cell, vacuum for gaff2 alone, else obc2.
-    Model scenes have natural masses and no constraints. Raises PreparationError for what contradicts.
+    Raises PreparationError for what contradicts.
     """
     name = spec.force_field
     if (name == MODEL) != (scene.interactions is not None) and name != "auto":
-        if name == MODEL:
-            raise PreparationError(
-                f"scene {scene.name!r} has no law of its own; give a force field instead of 'model'."
-            )
-        raise PreparationError(f"scene {scene.name!r} brings its own law; leave `force_field` out.")
+        brings = "has no" if name == MODEL else "brings its"
+        raise PreparationError(f"scene {scene.name!r} {brings} own law; leave `force_field` out.")
     if name == "auto":
         name = MODEL if scene.interactions is not None else _choose(scene)
     solvent = spec.solvent
@@ -93,9 +90,9 @@ def build_system(scene: Scene, spec: ForceFieldSpec) -> Any:
     """Return the `openmm.System` of a scene: without a cell no cut-off, in one PME; no centre-of-mass removal.
 
     Particles are the scene's atoms in its order; virtual sites (OPC) come after them. The OBC2 term is OpenMM's
-    GBSAOBCForce, not the CustomGBForce of implicit/obc2.xml, which gives the same energies (a test holds them together)
-    and is several times slower on small scenes. Raises PreparationError when the force field has no parameters for a
-    residue or a molecule, or does not suit the scene's cell.
+    GBSAOBCForce, several times faster than the CustomGBForce of implicit/obc2.xml, with the same energies. Raises
+    PreparationError when the force field has no parameters for a residue or a molecule, or does not suit the scene's
+    cell.
     """
     spec = resolve(scene, spec)
     if spec.force_field == MODEL:
@@ -161,8 +158,7 @@ def _build_mixed(scene: Scene, spec: ForceFieldSpec) -> Any:
                 f"{spec.protein} has no parameters for {', '.join(chain.lacking[:4])} of scene {scene.name!r}; such "
                 "residues are joined to ff14SB alone: use `force_field='ff14SB+gaff2'`."
             )
-        build = _build_molecule if chain is None else build_chain
-        parts.append((atoms, build(part, spec)))
+        parts.append((atoms, build_chain(chain, spec) if chain is not None else _build_molecule(part, spec)))
     system = merge(scene.n_atoms, parts)
     if spec.is_explicit:
         nonbonded = next(f for f in system.getForces() if isinstance(f, NonbondedForce))
@@ -183,6 +179,4 @@ def _build_molecule(scene: Scene, spec: ForceFieldSpec) -> Any:
     """Return the System of one GAFF2 molecule in vacuum."""
     from openmm import app
 
-    return load_openmm(parameters(scene)).createSystem(
-        nonbondedMethod=app.NoCutoff, rigidWater=False, **spec.openmm_settings()
-    )
+    return gaff.entry(scene).system(scene, nonbondedMethod=app.NoCutoff, rigidWater=False, **spec.openmm_settings())

@@ -1,5 +1,4 @@
-"""GAFF2 parameters and AM1-BCC charges of one molecule, through AmberTools; shipped and cached ones first. AMBER
-parameter files (prmtop) read, and put into another atom order.
+"""GAFF2 parameters and AM1-BCC charges of one molecule, through AmberTools; shipped and cached ones first.
 
 GAFF2: Wang, Wolf, Caldwell, Kollman and Case, J. Comput. Chem. 25, 1157 (2004), second generation (gaff2.dat). AM1-BCC:
 Jakalian, Jack and Bayly, J. Comput. Chem. 23, 1623 (2002).
@@ -10,12 +9,10 @@ from __future__ import annotations
 import gzip
 import json
 import logging
-import re
-import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from collections.abc import Iterator
+from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import dataclass, replace
 from importlib.resources import files
 from pathlib import Path
@@ -23,7 +20,7 @@ from typing import Any
 
 import numpy as np
 
-from md_reference.forces.mixture import molecules_of
+from md_reference.forces.mixture import molecules_of, permuted
 from md_reference.forces.programs import ambertools, complaint, find_ambertools, run, scratch_folder
 from md_reference.forces.spec import CHAIN_FILES, force_field_of, unmatched_residues
 from systems.chemistry.distance_bonds import changed_bond
@@ -33,7 +30,7 @@ from systems.files.native import cache_folder
 from systems.files.outside import content
 from systems.files.schema import built, parsed
 from systems.files.whole_file import create_whole, sealed, storage_error, unsealed
-from systems.scene import FloatArray, IntArray, Scene
+from systems.scene import FloatArray, Scene
 from systems.units import format_wall
 
 _FORMAT = 1
@@ -63,25 +60,21 @@ class Entry:
     prmtop: str
     source: dict[str, Any]
 
-    def ordered_as(self, scene: Scene) -> str:
-        """Return the prmtop text in the scene's atom order. Raises OutOfDomainError for another molecule."""
-        return Prmtop(self.prmtop).permuted(match_atoms(scene, self.scene)).text()
-
-
-def parameters(scene: Scene, *, cached: bool = True) -> str:
-    """Return the AMBER prmtop text of a molecule, atoms in the scene's order.
-
-    Shipped parameters are taken first, then those cached by `molecule_key` and program versions, and only then is
-    AmberTools run on the scene's bonds, charge and positions (`cached=False`: at once, and nothing is kept). Stereo
-    plays no part in GAFF2, and positions are left alone. What rounding leaves of the total charge is spread evenly.
-    Raises PreparationError with the reason for what GAFF2 or AM1-BCC cannot describe, and where AmberTools is needed
-    and absent.
-    """
-    return entry(scene, cached=cached).ordered_as(scene)
+    def system(self, scene: Scene, **settings: Any) -> Any:
+        """Return the `openmm.System` of the molecule, particles in the scene's order; `settings`: as `createSystem` of
+        `openmm.app.AmberPrmtopFile` takes them. Raises OutOfDomainError for another molecule."""
+        system = load_openmm(self.prmtop).createSystem(**settings)
+        return permuted(system, match_atoms(scene, self.scene))
 
 
 def entry(scene: Scene, *, cached: bool = True) -> Entry:
-    """Return what `parameters` reads: the prmtop in the order in which it was made, and its source."""
+    """Return the GAFF2 parameters and AM1-BCC charges of a molecule: shipped ones, else those cached by `molecule_key`
+    and program versions, else made by AmberTools from the scene's bonds, charge and positions (`cached=False`: at once,
+    and nothing is kept).
+
+    Stereo plays no part in GAFF2. What rounding leaves of the total charge is spread evenly. Raises PreparationError
+    with the reason for what GAFF2 or AM1-BCC cannot describe, and where AmberTools is needed and absent.
+    """
     refuse(scene)
     if not cached:
         return _parametrise(scene)
@@ -127,7 +120,7 @@ def read_entry(path: Path) -> Entry | None:
         record = dict(parsed(text if path.parent == _SHIPPED else unsealed(text)))
         is_known = record.pop("format") == _FORMAT
         found = built(Entry, record)
-        return found if is_known and Prmtop(found.prmtop).n_atoms == found.scene.n_atoms else None
+        return found if is_known and len(section(found.prmtop, "CHARGE")) == found.scene.n_atoms else None
     except (OSError, ValueError, LookupError, TypeError, InputError):
         return None
 
@@ -187,29 +180,25 @@ def refuse(scene: Scene) -> None:
 
 def rough_parameters(scene: Scene) -> str:
     """Return GAFF2 with Gasteiger's charges, which need no quantum mechanics, as AMBER prmtop text that is not cached:
-    for hot MD whose states a better method labels. Raises PreparationError as `parameters`."""
+    for hot MD whose states a better method labels. Raises PreparationError as `entry`."""
     refuse(scene)
-    return _parametrise(scene, "gas").ordered_as(scene)
+    return _parametrise(scene, "gas").prmtop
 
 
 def _parametrise(scene: Scene, charges: str = "bcc") -> Entry:
     tools = ambertools()
     with scratch_folder("surromd-gaff-") as folder:
         try:
-            if charges == "gas":
-                notes = _charges_and_types(scene, folder, charges=charges)
-            else:
-                with announced(scene) as waiting:
-                    notes = _charges_and_types(scene, folder, waiting)
+            with announced(scene) if charges == "bcc" else nullcontext():
+                notes = _charges_and_types(scene, folder, charges)
             _missing_terms(scene, folder)
             text = _assemble(folder)
         except PreparationError as error:
             raise PreparationError(f"scene {scene.name!r} cannot be given GAFF2 parameters: {error}") from error
-    made = Prmtop(text)
-    _check(scene, made)
+    _check(scene, text)
     # AmberTools rounds charges to 0.0001 e or so each; the sum must be whole for PME and for a neutral box.
-    residual = float(made.charges_e.sum()) - int(scene.formal_charges.sum())
-    made.fields["CHARGE"] = [q - residual * CHARGE_UNIT / scene.n_atoms for q in made.fields["CHARGE"]]
+    charges_e = charges_of(text)
+    residual = float(charges_e.sum()) - int(scene.formal_charges.sum())
     source = {
         "force_field": f"GAFF2 {tools.gaff2_version}",
         "charges": "AM1-BCC" if charges == "bcc" else "Gasteiger",
@@ -217,24 +206,22 @@ def _parametrise(scene: Scene, charges: str = "bcc") -> Entry:
         "residual_charge_e": round(residual, 6),
         "notes": notes,
     }
-    return Entry(scene, made.text(), source)
+    return Entry(scene, _with_charges(text, charges_e - residual / scene.n_atoms), source)
 
 
-def _charges_and_types(
-    scene: Scene, folder: Path, waiting: Callable[[float], None] | None = None, charges: str = "bcc"
-) -> list[str]:
+def _charges_and_types(scene: Scene, folder: Path, charges: str = "bcc") -> list[str]:
     """Run antechamber: atom types, bond types and charges into `typed.mol2`; return what was unusual."""
     (folder / "input.sdf").write_text(_sdf(scene))
     arguments = ["-i", "input.sdf", "-fi", "sdf", "-o", "typed.mol2", "-fo", "mol2", "-at", "gaff2", "-c", charges]
     arguments += ["-nc", str(int(scene.formal_charges.sum())), "-m", "1", "-rn", "MOL", "-s", "2", "-dr", "no"]
-    printed = run("antechamber", arguments, folder, waiting=waiting)
+    printed = run("antechamber", arguments, folder)
     if not (folder / "typed.mol2").exists():
         raise PreparationError(f"antechamber failed: {complaint(printed)}")
     if charges == "gas" or not _rearranged(scene, folder / "sqm.pdb"):
         return []
     # AM1-BCC wants the AM1 minimum; where that is another molecule (a proton that hops), the scene's own geometry.
     keywords = "qm_theory='AM1', maxcyc=0, scfconv=1.d-10, ndiis_attempts=700,"
-    run("antechamber", [*arguments, "-ek", keywords], folder, waiting=waiting)
+    run("antechamber", [*arguments, "-ek", keywords], folder)
     if _rearranged(scene, folder / "sqm.pdb"):
         raise PreparationError("its positions do not fit its bonds; minimise or repair the structure first")
     return ["AM1 charges at the scene's own geometry: the isolated molecule rearranges when AM1 minimises it"]
@@ -255,9 +242,9 @@ def _run_parmchk2(folder: Path) -> str:
     """Write what GAFF2's tables lack into `extra.frcmod`, and return it.
 
     parmchk2 of AmberTools 26 reads memory it has not set: on the same input it misses some of the tables in about every
-    second run, says that an angle which is there needs revision, and gives other impropers (aspirin's ring 1.1 or 10.5
-    kcal/mol). Beside the molecule it is therefore shown hydrogen cyanide, whose angle the tables hold, and is run again
-    until it finds that. Where the tables do not hold it, two runs must agree.
+    second run and gives other impropers (aspirin's ring 1.1 or 10.5 kcal/mol). Beside the molecule it is therefore
+    shown hydrogen cyanide, whose angle the tables hold, and is run again until it finds that. Where the tables do not
+    hold it, two runs must agree.
     """
     arguments = ["-i", "checked.mol2", "-f", "mol2", "-o", "extra.frcmod", "-s", "gaff2"]
     typed = (folder / "typed.mol2").read_text()
@@ -306,17 +293,19 @@ def _assemble(folder: Path) -> str:
     return out.read_text()
 
 
-def _check(scene: Scene, made: Prmtop) -> None:
+def _check(scene: Scene, prmtop: str) -> None:
     """Raise PreparationError unless the parameters are for exactly the scene's atoms, bonds and charge, in order."""
-    bonds = {(min(i, j), max(i, j)) for i, j in scene.bonds.tolist()}
-    charge, made_charge = int(scene.formal_charges.sum()), float(made.charges_e.sum())
-    if made.fields["ATOMIC_NUMBER"] != [_ATOMIC_NUMBERS[e] for e in scene.elements]:
+    topology = load_openmm(prmtop).topology
+    bonds = {frozenset(pair) for pair in scene.bonds.tolist()}
+    made = {frozenset((a.index, b.index)) for a, b in topology.bonds()}
+    charge, made_charge = int(scene.formal_charges.sum()), float(charges_of(prmtop).sum())
+    if tuple(a.element.symbol for a in topology.atoms()) != scene.elements:
         what = "other elements or another atom order"
-    elif made.bonds != bonds:
-        what = f"other bonds ({len(made.bonds - bonds)} more, {len(bonds - made.bonds)} fewer)"
+    elif made != bonds:
+        what = f"other bonds ({len(made - bonds)} more, {len(bonds - made)} fewer)"
     elif abs(made_charge - charge) > _CHARGE_TOLERANCE_E:
         what = f"charge {made_charge:+.3f} instead of {charge:+d}"
-    elif {"DU", "du"} & set(made.fields["AMBER_ATOM_TYPE"]):
+    elif {"DU", "du"} & set(section(prmtop, "AMBER_ATOM_TYPE")):
         what = "atoms it found no type for"
     else:
         return
@@ -351,152 +340,46 @@ def expected_s(n_atoms: int) -> float:
 
 
 @contextmanager
-def announced(scene: Scene) -> Iterator[Callable[[float], None] | None]:
-    """Say before and after a molecule's charges are computed how long that takes, where it is worth saying.
-
-    Yields what `programs.run_program` calls while it waits: on a terminal it keeps a line with the seconds so far. The
-    lines are warnings of the logger 'surromd.charges': on stderr unless a program that uses this package decides else.
-    """
+def announced(scene: Scene) -> Iterator[None]:
+    """Say before and after a molecule's charges are computed how long that takes, where it is worth saying: warnings of
+    the logger 'surromd.charges', on stderr unless a program that uses this package decides else."""
     expected = expected_s(scene.n_atoms)
     if expected < _WORTH_SAYING_S:
-        yield None
+        yield
         return
     about = format_wall(float(f"{expected:.1g}"))
     what = f"AM1-BCC charges of {scene.n_atoms} atoms, about {about} on an idle core, once: they are kept in the cache"
     _log.warning("%s: %s", scene.name, what)
-    on_terminal = sys.stderr.isatty() and _log.isEnabledFor(logging.WARNING)
     started = time.monotonic()
-
-    def waiting(_: float) -> None:
-        sys.stderr.write(f"\r{scene.name}: {format_wall(time.monotonic() - started)} of about {about} \x1b[K")
-        sys.stderr.flush()
-
-    try:
-        yield waiting if on_terminal else None
-    finally:
-        if on_terminal:
-            sys.stderr.write("\r\x1b[K")
+    yield
     _log.warning("%s: charges computed in %s", scene.name, format_wall(time.monotonic() - started))
 
 
-# ---- prmtop files ----------------------------------------------------------------------------------------------------
+# ---- AMBER parameter files (prmtop) ---------------------------------------------------------------------------------
 
 
-# (section, atoms in a record, numbers in a record); atom numbers are stored as 3 (i - 1).
-_TERMS = (("BONDS", 2, 3), ("ANGLES", 3, 4), ("DIHEDRALS", 4, 5))
-_PER_ATOM = (
-    "ATOM_NAME", "CHARGE", "ATOMIC_NUMBER", "MASS", "ATOM_TYPE_INDEX", "AMBER_ATOM_TYPE", "TREE_CHAIN_CLASSIFICATION",
-    "JOIN_ARRAY", "IROTAT", "RADII", "SCREEN",
-)  # fmt: skip
 # Amber's unit of charge: sqrt(kcal/mol Å) per elementary charge.
 CHARGE_UNIT = 18.2223
 
 
-class Prmtop:
-    """The sections of a prmtop file: `fields[name]` is a list of numbers or of strings, in the file's own units. Raises
-    InputError for text that is no prmtop of this kind (one molecule, no polarisability, no CMAP)."""
-
-    def __init__(self, text: str) -> None:
-        self.fields: dict[str, list[Any]] = {}
-        self._formats: dict[str, str] = {}
-        self._head = text.partition("%FLAG")[0]
-        for block in text.split("%FLAG")[1:]:
-            lines = [line for line in block.splitlines() if not line.startswith("%COMMENT")]
-            name, form = lines[0].strip(), lines[1].strip()
-            match = re.fullmatch(r"%FORMAT\((\d+)([aEIei])(\d+)(?:\.\d+)?\)", form)
-            if match is None:
-                raise InputError(f"prmtop section {name} has an unknown format {form}.")
-            width = int(match[3])
-            cells = [line[k : k + width] for line in lines[2:] for k in range(0, len(line.rstrip("\n")), width)]
-            kind = match[2].lower()
-            convert: Any = {"a": str.strip, "i": int, "e": float}[kind]
-            self.fields[name] = [convert(c) for c in cells if kind == "a" or c.strip()]
-            self._formats[name] = form
-        needed = {"POINTERS", "DIHEDRALS_INC_HYDROGEN", "EXCLUDED_ATOMS_LIST", *_PER_ATOM} - set(self.fields)
-        if needed:
-            raise InputError(f"not an AMBER prmtop file: it lacks {', '.join(sorted(needed))}.")
-        n = self.n_atoms
-        for name in _PER_ATOM:
-            self.fields[name] = self.fields[name][:n]
-            if len(self.fields[name]) != n:
-                raise InputError(f"prmtop section {name} has {len(self.fields[name])} entries for {n} atoms.")
-        if any("CMAP" in name for name in self.fields):
-            raise InputError("a prmtop file with CMAP terms cannot be reordered.")
-
-    @property
-    def n_atoms(self) -> int:
-        return int(self.fields["POINTERS"][0])
-
-    @property
-    def charges_e(self) -> FloatArray:
-        """Partial charges `(n_atoms,)` in elementary charges."""
-        return np.array(self.fields["CHARGE"], dtype=np.float64) / CHARGE_UNIT
-
-    @property
-    def bonds(self) -> set[tuple[int, int]]:
-        """Bonded pairs, i < j, from 0."""
-        flat = self.fields["BONDS_INC_HYDROGEN"] + self.fields["BONDS_WITHOUT_HYDROGEN"]
-        pairs = ((flat[k] // 3, flat[k + 1] // 3) for k in range(0, len(flat), 3))
-        return {(min(pair), max(pair)) for pair in pairs}
-
-    def permuted(self, order: IntArray) -> Prmtop:
-        """Return the same molecule with its atom k in place `order[k]`; every energy stays what it was."""
-        out = object.__new__(Prmtop)
-        out._head, out._formats = self._head, self._formats
-        out.fields = {name: list(values) for name, values in self.fields.items()}
-        to = [int(i) for i in order]
-        for name in _PER_ATOM:
-            for k, value in enumerate(self.fields[name]):
-                out.fields[name][to[k]] = value
-        for prefix, n_indices, width in _TERMS:
-            for suffix in ("_INC_HYDROGEN", "_WITHOUT_HYDROGEN"):
-                flat = out.fields[prefix + suffix]
-                for start in range(0, len(flat), width):
-                    flat[start : start + n_indices] = _moved(flat[start : start + n_indices], to)
-        out.fields["NUMBER_EXCLUDED_ATOMS"], out.fields["EXCLUDED_ATOMS_LIST"] = self._exclusions(to)
-        return out
-
-    def _exclusions(self, to: list[int]) -> tuple[list[int], list[int]]:
-        n = self.n_atoms
-        later: list[list[int]] = [[] for _ in range(n)]
-        partners = iter(self.fields["EXCLUDED_ATOMS_LIST"])
-        for i, count in enumerate(self.fields["NUMBER_EXCLUDED_ATOMS"]):
-            for _ in range(count):
-                j = next(partners)
-                if j > 0:
-                    a, b = sorted((to[i], to[j - 1]))
-                    later[a].append(b + 1)
-        # An atom without later partners still has one entry, a zero.
-        rows = [sorted(row) or [0] for row in later]
-        return [len(row) for row in rows], [j for row in rows for j in row]
-
-    def text(self) -> str:
-        """Return the file as text."""
-        parts = [self._head]
-        for name, values in self.fields.items():
-            form = self._formats[name]
-            match = re.fullmatch(r"%FORMAT\((\d+)([aEIei])(\d+)(?:\.(\d+))?\)", form)
-            assert match is not None
-            per_line, kind, width = int(match[1]), match[2].lower(), int(match[3])
-            spec = {"a": f"<{width}", "i": f">{width}", "e": f">{width}.{match[4]}E"}[kind]
-            cells = [format(v, spec) for v in values]
-            lines = ["".join(cells[k : k + per_line]) for k in range(0, len(cells), per_line)] or [""]
-            parts.append("\n".join([f"%FLAG {name:<74}", f"{form:<80}", *lines]) + "\n")
-        return "".join(parts)
+def section(prmtop: str, name: str) -> list[str]:
+    """Return the entries of a section of a prmtop, as words."""
+    block = prmtop.partition(f"%FLAG {name} ")[2].partition("%FLAG")[0]
+    return block.partition("%FORMAT")[2].partition("\n")[2].split()
 
 
-def _moved(indices: list[int], to: list[int]) -> list[int]:
-    """One term's stored atom numbers at their new places; the signs of a dihedral stay at its third and fourth atom.
+def charges_of(prmtop: str) -> FloatArray:
+    """Return the partial charges `(n_atoms,)` in elementary charges."""
+    return np.array(section(prmtop, "CHARGE"), dtype=np.float64) / CHARGE_UNIT
 
-    A negative third number says that the 1-4 pair is counted elsewhere, a negative fourth that the term is improper.
-    Zero has no sign, so a dihedral whose third or fourth atom is the first of the file is written backwards.
-    """
-    new = [3 * to[abs(i) // 3] for i in indices]
-    if len(indices) < 4:
-        return new
-    if 0 in new[2:]:
-        new.reverse()
-    return new[:2] + [-i if old < 0 else i for i, old in zip(new[2:], indices[2:], strict=True)]
+
+def _with_charges(prmtop: str, charges_e: FloatArray) -> str:
+    before, flag, after = prmtop.partition("%FLAG CHARGE ")
+    end = after.index("%FLAG")
+    cells = [f"{q * CHARGE_UNIT:16.8E}" for q in charges_e]
+    rows = ["".join(cells[k : k + 5]) for k in range(0, len(cells), 5)]
+    head = after[:end].splitlines()[:2]
+    return "\n".join([before + flag + head[0], head[1], *rows, after[end:]])
 
 
 def load_openmm(text: str) -> Any:

@@ -1,8 +1,4 @@
-"""Molecules and residues of a scene, found in its bonds; Systems of OpenMM joined, or put into another atom order.
-
-A scene may hold water, ions, peptides and other molecules, each parametrised apart, and its file may divide a peptide
-into residues in a way no force field knows.
-"""
+"""Molecules and residues of a scene, found in its bonds; Systems of OpenMM joined, or put into another atom order."""
 
 from __future__ import annotations
 
@@ -50,25 +46,23 @@ def solute_of(scene: Scene) -> IntArray:
 # ---- residues -------------------------------------------------------------------------------------------------------
 
 
-def regroup(scene: Scene, *, uncut: Iterable[tuple[int, int]] = ()) -> tuple[Scene, IntArray]:
+def regroup(scene: Scene) -> tuple[Scene, IntArray]:
     """Return the scene with its atoms gathered into residues, and `order (n_atoms,)`: its atom k was atom `order[k]`.
 
     Residues are what is left connected when the amide bonds of the backbone (C(=O)-N between carbons, and that of an
-    NH2 that ends a chain) and the disulfide bonds are cut, except the bonds `uncut` (i < j); they follow the chain from
-    its N to its C terminus, atoms keep their order within one. Names come from the first atom's residue. Force fields
-    recognise residues by their bonds, so names need not be right: a whole peptide in one residue 'UNL', or residues
-    whose atoms lie mixed, become what OpenMM's templates know.
+    NH2 that ends a chain) and the disulfide bonds are cut; they follow the chain from N to C terminus, atoms keep their
+    order within one. Force fields recognise residues by their bonds, so a whole peptide in one residue 'UNL', or
+    residues whose atoms lie mixed, become what OpenMM's templates know.
 
-    Energies do not depend on the order of atoms for alanine dipeptide (to rounding); in residues with several equal
-    neighbours about a planar atom (ARG, TRP, HIS) Amber's improper torsions depend on it, by some tenths of a kJ/mol.
+    In residues with several equal neighbours about a planar atom (ARG, TRP, HIS) Amber's improper torsions depend on
+    the order of atoms, by some tenths of a kJ/mol.
     """
-    kept = set(uncut)
     ends = np.array(_amide_ends(scene), dtype=np.int64).reshape(-1, 2)
     amides = np.concatenate([backbone_torsions(scene)["omega"][:, 1:3], ends]).tolist()
     cut = {(min(c, n), max(c, n)) for c, n in amides}
     cut |= {(i, j) for i, j in scene.bonds.tolist() if scene.elements[i] == scene.elements[j] == "S"}
     pieces = bonded_graph(scene).copy()
-    pieces.remove_edges_from(cut - kept)
+    pieces.remove_edges_from(cut)
     residues = [sorted(part) for part in nx.connected_components(pieces)]
     of_atom = {atom: k for k, atoms in enumerate(residues) for atom in atoms}
     along: nx.DiGraph = nx.DiGraph()
@@ -135,9 +129,8 @@ def _moved_terms(force: Any, to: Sequence[int] | None) -> Iterator[list[Any]]:
 def merge(n_atoms: int, parts: Iterable[tuple[IntArray, Any]]) -> Any:
     """Return one `openmm.System` of parts that do not share atoms: atom k of a part is particle `atoms[k]`.
 
-    A part's particles beyond its atoms (virtual sites) come after all atoms, in order. Parts interact by one
-    NonbondedForce with the usual combination rules, whose settings are those of the first part. Raises PreparationError
-    for forces that cannot be merged.
+    Virtual sites come after all atoms, in order. Parts interact by one NonbondedForce with the usual combination rules,
+    whose settings are those of the first part. Raises PreparationError for forces that cannot be merged.
     """
     import openmm
 
@@ -199,13 +192,13 @@ def _append(joint: Any, force: Any, to: list[int]) -> None:
 
 def permuted(system: Any, order: IntArray) -> Any:
     """Return an `openmm.System` whose particle `order[k]` is particle k of `system`: same masses, forces, constraints.
-
-    Particles beyond `order` (virtual sites, which come after all atoms) keep their places. Raises PreparationError for
-    a kind of force or of virtual site not known here, rather than guess its indices.
-    """
+    Virtual sites, which come after all atoms, keep their places. Raises PreparationError for a kind of force or of
+    virtual site not known here."""
     import openmm
 
     to = [*(int(i) for i in order), *range(len(order), system.getNumParticles())]
+    if to == sorted(to):
+        return system
     out = openmm.System()
     for k in np.argsort(to):
         out.addParticle(system.getParticleMass(int(k)))
@@ -234,7 +227,7 @@ def _permuted_force(force: Any, to: list[int]) -> Any:
             new.setParticleParameters(to[k], force.getParticleParameters(k))
         for k in range(force.getNumExclusions()):
             new.setExclusionParticles(k, *(to[i] for i in force.getExclusionParticles(k)))
-    else:
+    elif name != "CMMotionRemover":
         raise PreparationError(f"a {name} cannot be reordered; give standard residues, in order.")
     return new
 

@@ -62,41 +62,24 @@ class Chain:
 
 
 def find_chain(scene: Scene) -> Chain | None:
-    """Return a molecule of which ff14SB covers some amino acids, divided into residues; None where it covers none. A
-    cysteine bonded to a residue without a template is one with it."""
-    force_field = force_field_of(CHAIN_FILES)
-    uncut: set[tuple[int, int]] = set()
-    while True:
-        regrouped, order = regroup(scene, uncut=uncut)
-        unknown = set(unmatched_residues(regrouped, force_field))
-        of_atom = regrouped.residue_of_atom
-        bridges = {
-            (i, j)
-            for i, j in regrouped.bonds.tolist()
-            if regrouped.elements[i] == regrouped.elements[j] == "S"
-            and of_atom[i] != of_atom[j]
-            and unknown & {int(of_atom[i]), int(of_atom[j])}
-        }
-        if not bridges:
-            break
-        uncut |= {tuple(sorted((int(order[i]), int(order[j])))) for i, j in bridges}  # type: ignore[misc]
-    known = set(range(len(regrouped.residue_names))) - unknown
+    """Return a molecule of which ff14SB covers some amino acids, divided into residues; None where it covers none."""
+    regrouped, order = regroup(scene)
+    unknown = unmatched_residues(regrouped, force_field_of(CHAIN_FILES))
+    known = set(range(len(regrouped.residue_names))) - set(unknown)
     if not unknown or not any(_is_amino_acid(regrouped, r) for r in known):
         return None
-    return Chain(regrouped, order, tuple(sorted(unknown)))
+    return Chain(regrouped, order, tuple(unknown))
 
 
-def build_chain(scene: Scene, spec: ForceFieldSpec) -> Any:
-    """Return the `openmm.System`, in vacuum, of a molecule that `find_chain` finds a chain in; particles in its order.
+def build_chain(chain: Chain, spec: ForceFieldSpec) -> Any:
+    """Return the `openmm.System`, in vacuum, of a molecule in which `find_chain` finds a chain; particles in its order.
     Raises PreparationError where GAFF2 or AM1-BCC cannot describe a residue, or a term is left without parameters."""
     from openmm import app
 
-    chain = find_chain(scene)
-    if chain is None:
-        raise PreparationError(f"scene {scene.name!r} has no amino acid that ff14SB covers.")
-    named = {r: f"{chain.scene.residue_names[r]}-{r + 1}" for r in chain.unknown}
-    made = [make_template(cap(chain.scene, r), name)[0] for r, name in named.items()]
-    topology = chain.scene.to_openmm_topology()
+    scene = chain.scene
+    named = {r: f"{scene.residue_names[r]}-{r + 1}" for r in chain.unknown}
+    made = [make_template(cap(scene, r), name) for r, name in named.items()]
+    topology = scene.to_openmm_topology()
     try:
         system = app.ForceField(*CHAIN_FILES, *map(io.StringIO, made)).createSystem(
             topology,
@@ -109,7 +92,7 @@ def build_chain(scene: Scene, spec: ForceFieldSpec) -> Any:
         raise PreparationError(
             f"scene {scene.name!r} cannot be joined from its residues: {first_line(error)}."
         ) from error
-    _refuse_loose_atoms(chain.scene, system)
+    _refuse_loose_atoms(scene, system)
     return permuted(system, chain.order)
 
 
@@ -216,19 +199,18 @@ def _unit(vector: Any) -> FloatArray:
 # ---- templates -------------------------------------------------------------------------------------------------------
 
 
-def make_template(capped: CappedResidue, name: str) -> tuple[str, float]:
-    """Return the template of a capped residue's own atoms, in their order, as XML of an OpenMM force field, and the
-    charge (e) that was spread over them. Raises PreparationError where GAFF2 or AM1-BCC cannot describe it."""
+def make_template(capped: CappedResidue, name: str) -> str:
+    """Return the template of a capped residue's own atoms, in their order, as XML of an OpenMM force field. Raises
+    PreparationError where GAFF2 or AM1-BCC cannot describe it."""
     from openmm import app
 
     scene = capped.scene
-    system = gaff.load_openmm(gaff.parameters(scene)).createSystem(
-        nonbondedMethod=app.NoCutoff, constraints=None, rigidWater=False, removeCMMotion=False
-    )
+    vacuum = {"nonbondedMethod": app.NoCutoff, "constraints": None, "rigidWater": False, "removeCMMotion": False}
+    system = gaff.entry(scene).system(scene, **vacuum)
     backbone = backbone_types(capped)
     types = [t or (f"{name}-{k}" if k < capped.n_own else None) for k, t in enumerate(backbone)]
     terms, particles = _terms(system)
-    charges_e, spread_e = _own_charges(capped, particles)
+    charges_e = _own_charges(capped, particles)
     root = ElementTree.Element("ForceField")
     new = [k for k in range(capped.n_own) if backbone[k] is None]
     listed = ElementTree.SubElement(root, "AtomTypes")
@@ -250,7 +232,7 @@ def make_template(capped: CappedResidue, name: str) -> tuple[str, float]:
         _, sigma_nm, epsilon = particles[k]
         row = {"type": str(types[k]), "sigma": repr(sigma_nm), "epsilon": repr(epsilon)}
         ElementTree.SubElement(nonbonded, "Atom", row)
-    return ElementTree.tostring(root, encoding="unicode"), spread_e
+    return ElementTree.tostring(root, encoding="unicode")
 
 
 def backbone_types(capped: CappedResidue) -> list[str | None]:
@@ -317,8 +299,8 @@ def _terms(system: Any) -> tuple[Terms, list[tuple[float, ...]]]:
     return terms, particles
 
 
-def _own_charges(capped: CappedResidue, particles: list[tuple[float, ...]]) -> tuple[FloatArray, float]:
-    """Return the charges of the residue's own atoms, whole in sum, and what had to be spread over them."""
+def _own_charges(capped: CappedResidue, particles: list[tuple[float, ...]]) -> FloatArray:
+    """Return the charges of the residue's own atoms, whole in sum."""
     own = np.array([q for q, _, _ in particles[: capped.n_own]])
     whole = int(capped.scene.formal_charges[: capped.n_own].sum())
     spread = whole - float(own.sum())
@@ -327,7 +309,7 @@ def _own_charges(capped: CappedResidue, particles: list[tuple[float, ...]]) -> t
             f"AM1-BCC puts {own.sum():+.2f} e on {capped.scene.name} instead of {whole:+d}; give all hydrogens, "
             "or leave the residue out."
         )
-    return own + spread / capped.n_own, spread
+    return np.asarray(own + spread / capped.n_own)
 
 
 def _add_bonded(root: Any, scene: Scene, types: list[str | None], terms: Terms) -> None:
@@ -374,13 +356,9 @@ def _in_protein(tag: str, key: Key) -> bool:
     if not all(t.startswith(_PREFIX) for t in key):
         return False
     orders = [(key[0], *rest) for rest in permutations(key[1:])] if tag == "Improper" else [key, key[::-1]]
-    return any(_fits(order, _protein_terms()[tag]) for order in orders)
-
-
-def _fits(key: Key, rows: frozenset[Key]) -> bool:
-    if key in rows:
-        return True
-    return len(key) == 4 and any(all(r in ("", t) for r, t in zip(row, key, strict=True)) for row in rows)
+    return any(
+        all(r in ("", t) for r, t in zip(row, order, strict=True)) for row in _protein_terms()[tag] for order in orders
+    )
 
 
 @cache

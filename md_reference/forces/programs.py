@@ -1,8 +1,8 @@
-"""Other programs, run in folders of their own: neither outlives this process, whatever ends it. AmberTools among them.
+"""Other programs, which do not outlive this process, whatever ends it: AmberTools.
 
 Each is guarded by a shell that holds the other end of a pipe. When this process ends, by `kill -9` too, the pipe
-closes, and the guard kills the program with all that it has started, or removes the folder. A guard has a session of
-its own, so that a terminal's Ctrl-C and hang-up do not reach it.
+closes, and the guard kills the program with all that it has started. A guard has a session of its own, so that a
+terminal's Ctrl-C and hang-up do not reach it.
 """
 
 from __future__ import annotations
@@ -14,9 +14,7 @@ import signal
 import subprocess
 import sys
 import tempfile
-import time
-import uuid
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import cache
@@ -25,8 +23,6 @@ from pathlib import Path
 from systems.errors import PreparationError, StorageError
 from systems.interrupts import stop_if_asked
 
-Waiting = Callable[[float], None] | None
-
 # So often a program that runs is looked at, and a wish to stop is heard.
 _LOOK_S = 0.1
 # One process group: the program, what it starts, and a watch that kills them all when nobody holds the pipe any more.
@@ -34,23 +30,14 @@ _RUN = (
     "exec 3<&0 </dev/null; { trap '' HUP INT TERM; read -r _ <&3; kill -KILL 0; } 2>/dev/null & "
     '"$@" 3<&-; status=$?; kill -KILL $! 2>/dev/null; wait $! 2>/dev/null; exit $status'
 )
-# What is killed at the same moment may still be writing into the folder: some seconds of patience.
-_FOLDER = (
-    "trap '' HUP INT TERM PIPE; mkdir -m 700 -- \"$1\" || exit 1; echo made; read -r _; n=0; "
-    'until rm -rf -- "$1" 2>/dev/null || [ $n -ge 100 ]; do n=$((n + 1)); sleep 0.1; done'
-)
 
 
-def run_program(
-    command: list[str], folder: Path, environment: Mapping[str, str], *, waiting: Waiting = None
-) -> tuple[int, str]:
+def run_program(command: list[str], folder: Path, environment: Mapping[str, str]) -> tuple[int, str]:
     """Run a program in `folder` until it ends; return its exit status and what it printed, errors among the rest.
 
-    `waiting` is called several times a second with the seconds since the start. An interruption, also one that
-    `deferred_interrupt` has put off or that is meant for this thread, ends the program and whatever it has started:
-    KeyboardInterrupt. So does the end of this process. POSIX systems only.
+    An interruption, also one that `deferred_interrupt` has put off or that is meant for this thread, ends the program
+    and whatever it has started: KeyboardInterrupt. So does the end of this process. POSIX systems only.
     """
-    started = time.monotonic()
     with (
         tempfile.TemporaryFile() as output,
         subprocess.Popen(
@@ -70,8 +57,6 @@ def run_program(
                     break
                 except subprocess.TimeoutExpired:
                     stop_if_asked()
-                    if waiting is not None:
-                        waiting(time.monotonic() - started)
         except BaseException:
             os.killpg(process.pid, signal.SIGKILL)
             raise
@@ -81,27 +66,14 @@ def run_program(
 
 @contextmanager
 def scratch_folder(prefix: str) -> Iterator[Path]:
-    """Yield a new folder among the system's temporary ones; it goes with the block, and with this process. Raises
-    StorageError where it cannot be made. Where there is no shell (Windows) it goes with the block alone."""
-    if os.name != "posix":
-        with tempfile.TemporaryDirectory(prefix=prefix) as name:
-            yield Path(name)
-        return
-    path = Path(tempfile.gettempdir()) / f"{prefix}{uuid.uuid4().hex[:12]}"
-    with subprocess.Popen(
-        ["/bin/sh", "-c", _FOLDER, "surromd-guard", str(path)],
-        stdin=subprocess.PIPE,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        start_new_session=True,
-    ) as guard:
-        assert guard.stdin is not None and guard.stdout is not None and guard.stderr is not None
-        if guard.stdout.readline() != "made\n":
-            raise StorageError(
-                f"no temporary folder can be made: {guard.stderr.read().strip()}; free space or set TMPDIR."
-            )
-        yield path
+    """Yield a new folder among the system's temporary ones, which goes with the block. Raises StorageError where it
+    cannot be made."""
+    try:
+        folder = tempfile.TemporaryDirectory(prefix=prefix, ignore_cleanup_errors=True)
+    except OSError as error:
+        raise StorageError(f"no temporary folder can be made: {error}; free space or set TMPDIR.") from error
+    with folder as name:
+        yield Path(name)
 
 
 # ---- AmberTools as installed here -----------------------------------------------------------------------------------
@@ -159,12 +131,9 @@ def ambertools() -> AmberTools:
     return found
 
 
-def run(program: str, arguments: list[str], folder: Path, *, waiting: Waiting = None, **variables: str) -> str:
-    """Run one program in `folder`, with these environment variables added, and return what it printed.
-
-    `waiting`, interruptions and the end of this process: as `programs.run_program`; antechamber leaves its sqm running
-    for minutes otherwise. Raises PreparationError with the program's own complaint.
-    """
+def run(program: str, arguments: list[str], folder: Path, **variables: str) -> str:
+    """Run one program of AmberTools in `folder`, with these environment variables added, and return what it printed.
+    Raises PreparationError with the program's own complaint."""
     tools = ambertools()
     environment = os.environ | {
         "PATH": f"{tools.bin}{os.pathsep}{os.environ.get('PATH', '')}",
@@ -172,7 +141,7 @@ def run(program: str, arguments: list[str], folder: Path, *, waiting: Waiting = 
         "OMP_NUM_THREADS": "1",
         **variables,
     }
-    status, printed = run_program([str(tools.bin / program), *arguments], folder, environment, waiting=waiting)
+    status, printed = run_program([str(tools.bin / program), *arguments], folder, environment)
     printed = _COLOUR.sub("", printed)
     if status != 0:
         raise PreparationError(f"{program} failed: {complaint(printed)}")

@@ -8,7 +8,6 @@ from __future__ import annotations
 import ctypes
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -38,10 +37,9 @@ def build_quantum_system(
     """Return an `openmm.System` whose one force is GFN2-xTB, without a cell, in vacuum or `alpb-water`.
 
     `hydrogen_mass_da`: taken from the atom a hydrogen is bonded to; None leaves natural masses. With
-    `constrain_hydrogens` bonds to hydrogen are as long as in the nearest minimum of the energy, and rigid.
-    Every force is an SCF from scratch, so that it depends on positions alone and a resumed run repeats an undisturbed
-    one. Raises PreparationError where tblite or PythonForce is missing, for elements beyond radon, for scenes too
-    large, and where that minimum is another molecule.
+    `constrain_hydrogens` bonds to hydrogen are as long as in the nearest minimum of the energy, and rigid. Every force
+    is an SCF from scratch, so that a resumed run repeats an undisturbed one. Raises PreparationError where tblite or
+    PythonForce is missing, for elements beyond radon, for scenes too large, and where that minimum is another molecule.
     """
     import openmm
 
@@ -57,7 +55,7 @@ def build_quantum_system(
     for mass_da in _masses_da(scene, hydrogen_mass_da).tolist():
         system.addParticle(mass_da)
 
-    force = openmm.PythonForce(_Compute(potential))
+    force = openmm.PythonForce(potential.of_state)
     force.setName("GFN2-xTB")
     system.addForce(force)
     if constrain_hydrogens and (bonds := _hydrogen_bonds(scene)):
@@ -80,23 +78,6 @@ def refuse_rearranged(scene: Scene, positions_nm: FloatArray) -> None:
 def check_minimum(scene: Scene) -> None:
     """Raise PreparationError where GFN2-xTB, in vacuum, minimises a scene to another molecule."""
     refuse_rearranged(scene, _minimum_nm(scene, build_quantum_system(scene)))
-
-
-@dataclass(frozen=True, eq=False)
-class _Compute:
-    """The potential as OpenMM calls it; a copy of the System takes it along, pickled."""
-
-    potential: Potential
-
-    def __call__(self, state: Any) -> tuple[float, FloatArray]:
-        positions_nm = np.asarray(state.getPositions(asNumpy=True)._value, dtype=np.float64)
-        try:
-            return self.potential(positions_nm)
-        except PreparationError:
-            if state.getStepCount() > 0:
-                raise
-            # A minimiser's first trial moves all atoms by 1 nm in sum; it must learn that this is uphill.
-            return _UPHILL_KJ_MOL, np.zeros_like(positions_nm)
 
 
 def _hydrogen_bonds(scene: Scene) -> list[tuple[int, int]]:
@@ -183,6 +164,17 @@ class Potential:
 
     def __reduce__(self) -> tuple[type[Potential], tuple[Scene, str]]:
         return Potential, (self._scene, self._solvent)
+
+    def of_state(self, state: Any) -> tuple[float, FloatArray]:
+        """Return energy and forces as OpenMM asks for them."""
+        positions_nm = np.asarray(state.getPositions(asNumpy=True)._value, dtype=np.float64)
+        try:
+            return self(positions_nm)
+        except PreparationError:
+            if state.getStepCount() > 0:
+                raise
+            # A minimiser's first trial moves all atoms by 1 nm in sum; it must learn that this is uphill.
+            return _UPHILL_KJ_MOL, np.zeros_like(positions_nm)
 
     def __call__(self, positions_nm: FloatArray) -> tuple[float, FloatArray]:
         try:

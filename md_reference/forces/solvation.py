@@ -47,10 +47,9 @@ def solvate(scene: Scene, spec: ForceFieldSpec, box: WaterBox, *, seed: int = 0,
 
     Wherever the solute turns, its periodic images stay `box.padding_nm` apart, also where it stretches if it has up to
     100 atoms. The cell is a cube or a rhombic dodecahedron, whichever is smaller, its height at least twice the cutoff
-    and 0.35 nm, and its volume that of 1 bar at `temperature_k`. The scene's atoms come first, in their order, moved to
-    the middle of the cell; then waters, then ions. Which waters become ions is drawn with `seed`, from those 0.5 nm
-    from the solute and from each other where there are enough. Raises PreparationError for a scene that has a cell,
-    another solvent, or a cell of too many atoms.
+    and 0.35 nm, its volume that of 1 bar at `temperature_k`. The scene's atoms come first, then waters, then ions,
+    which waters become drawn with `seed`. Raises PreparationError for a scene that has a cell, another solvent, or a
+    cell of too many atoms.
     """
     if not spec.is_explicit:
         raise PreparationError(f"solvent {spec.solvent!r} has no molecules to add; give `solvent='tip3p'` or opc.")
@@ -140,11 +139,8 @@ def _bulk() -> tuple[FloatArray, FloatArray]:
 def _fill(
     cell: FloatArray, solute: FloatArray, elements: tuple[str, ...], wanted: int, rng: np.random.Generator
 ) -> FloatArray:
-    """Return up to `wanted` waters `(n, 3, 3)` nm in the cell, none too near the solute or another water's image.
-
-    The bulk does not fit the cell, so that waters at its walls collide with their neighbours' images and go; the gaps
-    this leaves are filled from the same bulk laid elsewhere, as often as it takes.
-    """
+    """Return up to `wanted` waters `(n, 3, 3)` nm in the cell, none too near the solute or another water's image: the
+    gaps that colliding waters leave at the walls are filled from the same bulk laid elsewhere, as often as it takes."""
     from scipy.spatial import cKDTree
 
     reach = np.array([covalent_radius_nm(e) for e in elements]) + _SHELL_NM

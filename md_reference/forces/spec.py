@@ -48,17 +48,14 @@ class WaterBox:
 
 @dataclass(frozen=True)
 class ForceFieldSpec:
-    """What the forces are. `hydrogen_mass_da=None` leaves natural masses; bonds to hydrogen are always constrained
-    when `constrain_hydrogens` (needed above 1 fs).
+    """What the forces are. `hydrogen_mass_da=None` leaves natural masses; rigid bonds to hydrogen are needed above 1
+    fs.
 
     `force_field`: a protein force field; 'gaff2' (GAFF2 with AM1-BCC charges) for any other molecule; 'ff14SB+gaff2'
-    for scenes with both; 'gfn2-xtb' (quantum mechanics by tblite); 'model' for scenes with
-    `interactions`; 'auto', which `resolve` settles for a scene.
-
-    `solvent`: 'obc2' (GBSA-OBC2, Onufriev 2004, with mbondi2 radii as in OpenMM's implicit/obc2.xml), 'gbn2' (Nguyen
-    2013, mbondi3), 'amber99-obc' (the radii of OpenMM's amber99_obc.xml, ff99SB-ILDN only), 'tip3p' or 'opc' (explicit,
-    for scenes with a periodic cell: `solvation.solvate`), 'alpb-water' (Ehlert 2021; gfn2-xtb only), 'vacuum', or
-    'auto'.
+    for scenes with both; 'gfn2-xtb' (quantum mechanics by tblite); 'model' for scenes with `interactions`; 'auto',
+    which `resolve` settles. `solvent`: 'obc2' (GBSA-OBC2, Onufriev 2004, mbondi2 radii), 'gbn2' (Nguyen 2013, mbondi3),
+    'amber99-obc' (ff99SB-ILDN only), 'tip3p' or 'opc' (explicit: `solvation.solvate`), 'alpb-water' (Ehlert 2021;
+    gfn2-xtb only), 'vacuum', or 'auto'.
     """
 
     force_field: str = option("Force field: ff14SB, ff19SB, ff99SB-ILDN, charmm36, gaff2, gfn2-xtb.", "ff14SB")
@@ -68,7 +65,7 @@ class ForceFieldSpec:
     hydrogen_mass_da: float | None = option(
         "Mass of hydrogens after repartitioning, or 'natural'.", 3.0, read=parse_hydrogen_mass_da
     )
-    constrain_hydrogens: bool = True
+    constrain_hydrogens: bool = option("Keep bonds to hydrogen rigid.", True, words=None)
 
     def __post_init__(self) -> None:
         for what, name, known in (
@@ -77,20 +74,17 @@ class ForceFieldSpec:
             if name not in known:
                 meant = nearest(name, list(known))
                 raise UnknownNameError(f"unknown {what} {name!r}; known: {', '.join(known)}.{meant}")
-        if self.solvent == "amber99-obc" and self.force_field != "ff99SB-ILDN":
-            raise PreparationError("solvent 'amber99-obc' goes with `force_field='ff99SB-ILDN'`; use obc2 otherwise.")
-        if self.solvent in QUANTUM_SOLVENTS and self.force_field != QUANTUM:
-            raise PreparationError(
-                f"solvent {self.solvent!r} goes with `level='{QUANTUM}'`; use obc2 or tip3p otherwise."
-            )
-        own = {QUANTUM: QUANTUM_SOLVENTS, MODEL: ()}.get(self.force_field, SOLVENTS)
+        only = {"amber99-obc": "ff99SB-ILDN", **dict.fromkeys(QUANTUM_SOLVENTS, QUANTUM)}.get(self.solvent)
+        if only and self.force_field != only:
+            raise PreparationError(f"solvent {self.solvent!r} goes with {only} alone; use obc2 or tip3p otherwise.")
+        own = {QUANTUM: QUANTUM_SOLVENTS, MODEL: (), "charmm36": ("obc2", "gbn2", "tip3p")}.get(
+            self.force_field, SOLVENTS
+        )
         if self.solvent not in (*own, "vacuum", "auto"):
             instead = "".join(f"{name}, " for name in own)
             raise PreparationError(
                 f"{self.force_field} has no solvent {self.solvent!r}; give {instead}vacuum, or leave `solvent` out."
             )
-        if self.force_field == "charmm36" and self.solvent == "opc":
-            raise PreparationError("charmm36 has no parameters for OPC water and its ions; use `solvent='tip3p'`.")
 
     @staticmethod
     def of(record: Mapping[str, Any]) -> ForceFieldSpec:

@@ -1,15 +1,9 @@
-"""Peptides, sugars, water and ions: Systems from OpenMM's residue templates, with generalised Born terms.
-
-GLYCAM_06j-1 (Kirschner et al., J. Comput. Chem. 29, 622 (2008)) has a template for each sugar, anomer and set of linked
-oxygens; epimers have the same bonds, so that bonds alone do not tell them apart, but names, links and handedness do.
-"""
+"""Peptides, nucleic acids, water and ions: Systems from OpenMM's residue templates, with generalised Born terms."""
 
 from __future__ import annotations
 
 import re
 from dataclasses import replace
-from functools import cache
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -23,89 +17,8 @@ from md_reference.forces.spec import (
     unmatched_residues,
     water_file,
 )
-from systems.chemistry.geometry import signed_volumes
 from systems.errors import InputError, PreparationError, first_line
 from systems.scene import IntArray, Scene
-
-GLYCAM_FILE = "amber14/GLYCAM_06j-1.xml"
-# Names in the Protein Data Bank: GLYCAM's letters of sugar and anomer, and the handedness of C1 to C5 (the sign of the
-# volume spanned by the two ring neighbours and the hydrogen), computed by docs/studies/preparation/sugar_handedness.py.
-SUGARS = {
-    "NAG": ("YB", "++-+-"), "NDG": ("YA", "-+-+-"), "NGA": ("VB", "++---"), "A2G": ("VA", "-+---"),
-    "MAN": ("MA", "---+-"), "BMA": ("MB", "+--+-"), "GLC": ("GA", "-+-+-"), "BGC": ("GB", "++-+-"),
-    "GAL": ("LB", "++---"), "GLA": ("LA", "-+---"), "FUC": ("fA", "+-+++"), "FUL": ("fB", "--+++"),
-    "XYP": ("XB", "++-+."), "XYS": ("XA", "-+-+."), "RAM": ("hA", "+++-+"),
-}  # fmt: skip
-CENTRES = (("C1", "C2", "O5", "H1"), ("C2", "C1", "C3", "H2"), ("C3", "C2", "C4", "H3"), ("C4", "C3", "C5", "H4"),
-            ("C5", "C4", "O5", "H5"))  # fmt: skip
-# Amino acids that carry sugars, under their own and under GLYCAM's names.
-_ANCHORS = ("ASN", "SER", "THR", "HYP", "NLN", "OLS", "OLT", "OLP")
-# Oxygens that are linked onwards, and the letter that GLYCAM has for them.
-_LINKS = {
-    "": "0", "2": "2", "3": "3", "4": "4", "6": "6", "23": "Z", "24": "Y", "26": "X", "34": "W", "36": "V", "46": "U",
-    "234": "T", "236": "S", "246": "R", "346": "Q", "2346": "P",
-}  # fmt: skip
-
-
-def glycan_templates(scene: Scene) -> dict[int, str]:
-    """Return GLYCAM's template of each residue that is a sugar bonded at its C1, by its number in the scene.
-
-    Residues named as in the Protein Data Bank whose handedness is that of their name, and residues named as in GLYCAM.
-    Others, a free reducing end among them, are left out.
-    """
-    found = {}
-    for r, name in enumerate(scene.residue_names):
-        if name in SUGARS:
-            code = _code(scene, name, np.flatnonzero(scene.residue_of_atom == r).tolist())
-        else:  # sugars as GLYCAM writes them: three characters, the last an anomer
-            code = name if re.fullmatch(r"[0-9P-Z][A-Za-z][AB]", name) else ""
-        if code and code in glycam_names():
-            found[r] = code
-    return found
-
-
-def covered_by_glycam(scene: Scene) -> set[int]:
-    """Return the sugars that GLYCAM has, and the amino acids to which one of them is bonded at its C1."""
-    sugars = set(glycan_templates(scene))
-    of_atom, names = scene.residue_of_atom, scene.residue_names
-    anchors = {
-        int(of_atom[b])
-        for i, j in scene.bonds.tolist()
-        for a, b in ((i, j), (j, i))
-        if int(of_atom[a]) in sugars and scene.atom_names[a] == "C1" and names[of_atom[b]] in _ANCHORS
-    }
-    return sugars | anchors
-
-
-def _code(scene: Scene, name: str, atoms: list[int]) -> str:
-    """Return GLYCAM's name of a sugar, or an empty string."""
-    near = scene.neighbours()
-    at = {scene.atom_names[i]: i for i in atoms}
-    letters, signs = SUGARS[name]
-    hydrogen = {a: next((j for j in near[at[a]] if scene.elements[j] == "H"), -1) for a in at if a[0] == "C"}
-    for (centre, a, b, _), sign in zip(CENTRES, signs, strict=True):
-        if sign == ".":
-            continue
-        row = [at.get(centre, -1), at.get(a, -1), at.get(b, -1), hydrogen.get(centre, -1)]
-        if min(row) < 0 or (signed_volumes(scene.positions_nm, [row])[0] > 0) != (sign == "+"):
-            return ""
-    beyond = {a for a, i in at.items() if set(near[i]) - set(atoms)}
-    if "C1" not in beyond or not all(a == "C1" or re.fullmatch(r"O[2346]", a) for a in beyond):
-        return ""
-    links = "".join(sorted(a[1] for a in beyond if a[0] == "O"))
-    return _LINKS.get(links, "?") + letters
-
-
-@cache
-def glycam_names() -> frozenset[str]:
-    """Return the names of GLYCAM's templates."""
-    from openmm import app
-
-    text = (Path(app.__file__).parent / "data" / GLYCAM_FILE).read_text()
-    return frozenset(re.findall(r'<Residue name="(\w+)"', text))
-
-
-# ---- systems --------------------------------------------------------------------------------------------------------
 
 
 class Unmatched(Exception):
@@ -118,12 +31,9 @@ class Unmatched(Exception):
 
 
 def build_templated(scene: Scene, spec: ForceFieldSpec) -> Any:
-    """Return the `openmm.System` of a scene that the templates of `spec.force_field` cover, implicit solvent included.
-
-    Where the scene's own division into residues is not known to the force field, the one found in the bond graph is
-    tried (`regrouping`). Particles are in the scene's order either way, virtual sites after all atoms.
-    Raises PreparationError when the force field has no parameters for a residue.
-    """
+    """Return the `openmm.System` of a scene that the templates of `spec.force_field` cover, implicit solvent included,
+    particles in the scene's order, virtual sites after all atoms. Where the force field does not know the scene's
+    residues, those found in the bond graph are tried. Raises PreparationError for a residue without parameters."""
     scene = _with_water_named(scene)
     try:
         return _build(scene, spec)
@@ -150,8 +60,6 @@ def uncovered_residue(scene: Scene, protein: str) -> str | None:
     force_field = force_field_of(chain_files(protein))
     try:
         found = unmatched_residues(scene, force_field)
-        if found and protein == "ff14SB":
-            found = sorted(set(found) - covered_by_glycam(scene))
     except InputError:
         found = [0]  # residues that are not contiguous
     if found:
@@ -168,15 +76,10 @@ def _build(scene: Scene, spec: ForceFieldSpec) -> Any:
     if is_charmm:
         scene = _with_caps_joined(scene)
     topology = scene.to_openmm_topology()
-    names = glycan_templates(scene) if spec.force_field == "ff14SB" else {}
     wanted = [*chain_files(spec.force_field)]
-    if names:
-        wanted.insert(1, GLYCAM_FILE)
-        # GLYCAM has an acetyl, ACX, with the bonds of ACE.
-        names |= {r: "ACE" for r, name in enumerate(scene.residue_names) if name == "ACE"}
+    templates = {}
     if is_charmm:  # capped alanine is in its files twice; ALAD is the one with the protein's types
-        names = {r.index: "ALAD" for r in topology.residues() if r.name == "ALA" and len(r) == 22}
-    templates = {residue: names[residue.index] for residue in topology.residues() if residue.index in names}
+        templates = {r: "ALAD" for r in topology.residues() if r.name == "ALA" and len(r) == 22}
     needs_water = spec.is_explicit or any(len(m) == 1 or is_water(scene.elements, m) for m in molecules_of(scene))
     if needs_water and (water := water_file(spec.force_field, spec.solvent)):
         wanted.append(water)
@@ -191,16 +94,15 @@ def _build(scene: Scene, spec: ForceFieldSpec) -> Any:
         if near_nm is not None:
             settings["switchDistance"] = near_nm * unit.nanometer
     real = list(range(scene.n_atoms))
-    # CHARMM's terminal residues are patches, which only createSystem tries; sugars have names, not bonds alone.
-    if spec.solvent != "opc" and not is_charmm and not names:
+    # CHARMM's terminal residues are patches, which only createSystem tries.
+    if spec.solvent != "opc" and not is_charmm:
         for residue in force_field.getUnmatchedResidues(topology):
             raise Unmatched(scene, residue.index)
     try:
         if spec.solvent == "opc":  # whose waters have a virtual site
             modeller = app.Modeller(topology, scene.positions_nm * unit.nanometer)
-            modeller.addExtraParticles(force_field, residueTemplates=templates)
+            modeller.addExtraParticles(force_field)
             topology = modeller.topology
-            templates = {residue: names[residue.index] for residue in topology.residues() if residue.index in names}
             real = [a.index for a in topology.atoms() if a.element is not None]
         system = force_field.createSystem(
             topology, residueTemplates=templates, rigidWater=True, **settings, **spec.openmm_settings()

@@ -1,8 +1,5 @@
-"""The settings of one reference run, as records and checkpoints keep them, and whether two runs have the same.
-
-They are what the user gave, else the protocol asked for by name, else the program's defaults, which are those of the
-molecule, under whichever name it is asked for. Model systems bring settings of their own.
-"""
+"""The settings of one reference run: what the user gave, else the protocol asked for by name, else the program's
+defaults; and whether two runs have the same. Model systems bring settings of their own."""
 
 from __future__ import annotations
 
@@ -41,9 +38,7 @@ class Conditions:
     ensemble: str = option("Ensemble: nvt, nve or npt.", "nvt")
     pressure_bar: float = option("Barostat pressure (npt).", 1.0)
     seed: int = 0
-    platform: str = option(
-        "OpenMM platform; auto: the fastest, timed here; simd: 16 replicas at once on one core.", "auto"
-    )
+    platform: str = option("OpenMM platform; auto: by size; simd: 16 replicas at once on one core.", "auto")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -113,8 +108,8 @@ def resolved(scene: Scene, config: MDConfig) -> MDConfig:
     """Return the settings with force field, solvent and ensemble resolved for this scene (solvated, where the solvent
     is explicit): the one value that every later stage of a run takes.
 
-    Raises UnknownNameError (with the nearest name), InputError for a constant pressure without a periodic cell, and
-    what `forcefield.resolve` raises.
+    Raises UnknownNameError, InputError for a constant pressure without a periodic cell, and what `forcefield.resolve`
+    raises.
     """
     from md_reference.forces.forcefield import resolve  # the builders of forces are slow to import
 
@@ -164,20 +159,18 @@ def defaults() -> dict[str, Any]:
     return found | {"force_field": "auto", "solvent": "auto"}
 
 
-def resolve_settings(scene: Scene, given: Mapping[str, Any], protocol: str | None = None) -> tuple[dict[str, Any], str]:
-    """Return all settings of a run of `scene`, and a line about what its protocol decided, empty where nothing.
+def resolve_settings(
+    scene: Scene | str, given: Mapping[str, Any], protocol: str | None = None
+) -> tuple[dict[str, Any], str]:
+    """Return all settings of a run of a scene, or of what has this name, and a line about what its protocol decided,
+    empty where nothing.
 
     `given` holds what the user asked for, by the names of MDConfig and ForceFieldSpec; `protocol` names a paper's. Its
     solvent goes with its force field and is left out when the user names another one; its flexible bonds are left out
     above a time step of 1 fs. Quantum forces have flexible bonds and natural hydrogens up to that step (at 0.5 fs if
     only these are asked for). Raises UnknownNameError, and InputError for a model system, whose settings are its own.
     """
-    name = scene.provenance.get("library_name")
-    return resolve_by_name(name if isinstance(name, str) else "", given, protocol)
-
-
-def resolve_by_name(name: str, given: Mapping[str, Any], protocol: str | None = None) -> tuple[dict[str, Any], str]:
-    """Return what `resolve_settings` does for the scene of this name, or any other if the library does not know it."""
+    name = scene if isinstance(scene, str) else str(scene.provenance.get("library_name") or "")
     decisive, said_as = _decisive(name, protocol)
     if "force_field" in given:
         decisive.pop("solvent", None)

@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 import numpy.typing as npt
@@ -14,18 +14,16 @@ import numpy.typing as npt
 from md_reference.forces.forcefield import build_system
 from md_reference.forces.mixture import solute_of
 from md_reference.forces.quantum import refuse_rearranged
-from md_reference.forces.spec import QUANTUM
+from md_reference.forces.spec import QUANTUM, ForceFieldSpec
 from md_reference.run.config import Conditions
-from md_reference.run.machine import choose_platform, make_context
+from md_reference.run.machine import make_context, platform_for
 from systems.chemistry.element_data import covalent_radius_nm
-from systems.chemistry.geometry import signed_volumes
-from systems.chemistry.graph import stereocentres
+from systems.chemistry.validity import changed_stereo
 from systems.errors import PreparationError, SimulationError, first_line, listed
 from systems.scene import FloatArray, Scene, part_of
 from systems.units import GAS_CONSTANT_KJ_MOL_K, hottest_k
 
 _VELOCITY_TOLERANCE = 1e-8
-_FLAT_NM3 = 2e-4
 _STEPS_BETWEEN_VOLUME_MOVES = 25
 # A bond is broken that is longer than so many sums of covalent radii; the longest of a minimised molecule are 1.1.
 _BROKEN = 1.25
@@ -38,7 +36,7 @@ _SPRINGS_GROUP = 31
 
 @dataclass(frozen=True)
 class State:
-    """Positions `(n_atoms, 3)` nm, energies in kJ/mol, time in ps, kinetic temperature in K.
+    """Positions `(n_atoms, 3)` nm, energies in kJ/mol, kinetic temperature in K.
 
     Where asked for: velocities `(n_atoms, 3)` nm/ps and forces `(n_atoms, 3)` kJ/mol/nm, without those of constraints.
     Box vectors `(3, 3)` nm in a periodic system.
@@ -47,7 +45,6 @@ class State:
     positions_nm: FloatArray
     potential_kj_mol: float
     kinetic_kj_mol: float
-    time_ps: float
     temperature_k: float
     velocities_nm_ps: FloatArray | None = None
     forces_kj_mol_nm: FloatArray | None = None
@@ -68,16 +65,11 @@ def _openmm_errors(what: str) -> Iterator[None]:
 
 def refuse_damaged(scene: Scene, minimised_nm: FloatArray) -> None:
     """Raise PreparationError where a bond of the solute broke in the minimisation, which left positions `(n_atoms, 3)`
-    nm, or a stereocentre turned over; one that the scene has flat may go either way.
-
-    Minimising parts atoms that clash; from a geometry that is broken it can leave a bond stretched, one that runs
-    through a ring say.
-    """
-    if scene.interactions is not None:
-        return
+    nm, as one that runs through a ring does, or where its handedness changed."""
     atoms = solute_of(scene)
-    inside = np.isin(scene.bonds, atoms).all(axis=1) if len(atoms) else slice(None)
-    bonds = scene.bonds[inside]
+    if scene.interactions is not None or not len(atoms):
+        return
+    bonds = scene.bonds[np.isin(scene.bonds, atoms).all(axis=1)]
     radii_nm = np.array([sum(covalent_radius_nm(scene.elements[i]) for i in bond) for bond in bonds.tolist()])
     was, now = (np.linalg.norm(x[bonds[:, 0]] - x[bonds[:, 1]], axis=1) for x in (scene.positions_nm, minimised_nm))
     broken = np.flatnonzero((now > _BROKEN * radii_nm) & (was <= _BROKEN * radii_nm))
@@ -87,15 +79,10 @@ def refuse_damaged(scene: Scene, minimised_nm: FloatArray) -> None:
             f"{scene.name}: minimising its energy breaks the bond {listed(names, 3)} ({10 * now[broken[0]]:.2f} Å), as "
             "atoms stand in each other there; correct the coordinates, or build the molecule anew."
         )
-    centres = stereocentres(part_of(scene, atoms))
-    rows = atoms[centres] if len(atoms) else centres
-    before, after = (signed_volumes(x, rows) for x in (scene.positions_nm, minimised_nm))
-    turned = rows[(np.abs(before) > _FLAT_NM3) & (np.sign(before) != np.sign(after)), 0].tolist()
-    if turned:
-        names = [_atom_name(scene, i) for i in turned]
+    if what := changed_stereo(part_of(scene, atoms), minimised_nm[atoms][None])[0]:
         raise PreparationError(
-            f"{scene.name}: minimising its energy turns the stereocentre {listed(names)} over, as the geometry is "
-            "broken there; correct the coordinates, or build the molecule anew."
+            f"{scene.name}: when its energy is minimised {what}, as the geometry is broken there; correct the "
+            "coordinates, or build the molecule anew."
         )
 
 
@@ -107,10 +94,10 @@ def _atom_name(scene: Scene, i: int) -> str:
 class Engine:
     """One scene, one force field, one integrator, one Context. Use as a context manager or call `close`.
 
-    `conditions`: force field and ensemble resolved for the scene (`config.resolved`). `threads`: of the CPU platform,
-    where they are chosen. `system`: what `build_system` returned for this scene and these forces, where it is there
-    already; a barostat is added to it. Virtual sites are placed here and appear nowhere else.
-    Raises what `build_system` raises, and SimulationError when the platform cannot run the scene.
+    `conditions`: force field and ensemble resolved for the scene (`config.resolved`). `threads`: of the CPU platform.
+    `system`: what `build_system` returned, where it is there already; a barostat is added to it. Virtual sites are
+    placed here and appear nowhere else. Raises what `build_system` raises, and SimulationError when the platform cannot
+    run the scene.
     """
 
     def __init__(self, scene: Scene, conditions: Conditions, *, threads: int | None = None, system: Any = None) -> None:
@@ -119,7 +106,7 @@ class Engine:
         self.ensemble = conditions.ensemble
         self.scene = scene
         self.spec = conditions.force
-        choice = choose_platform(scene.n_atoms, conditions.platform, born=self.spec.solvent != "vacuum")
+        choice = platform_for(scene, conditions)
         self.platform_name, self.threads = choice.name, threads or choice.threads
         self._system = build_system(scene, self.spec) if system is None else system
         # OpenMM reads a seed of 0 as "choose one from the clock".
@@ -145,7 +132,7 @@ class Engine:
         # Degrees of freedom that hold kinetic energy; without a bath those of the centre of mass are at rest.
         self.n_dof = 3 * int(np.count_nonzero(self._masses_da)) - self.n_constraints - 3 * self._keeps_momentum
 
-    def __enter__(self) -> Engine:
+    def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -178,7 +165,7 @@ class Engine:
         self._context.setVelocities(velocities)
 
     def take_over(self, state: State) -> None:
-        """Take over cell, positions and velocities of another engine of this scene; the clock stays as it is."""
+        """Take over cell, positions and velocities of another engine of this scene."""
         if state.cell_nm is not None:
             self._context.setPeriodicBoxVectors(*np.asarray(state.cell_nm, dtype=np.float64).tolist())
         self.set_positions(state.positions_nm)
@@ -200,8 +187,8 @@ class Engine:
     def minimise(self, *, max_iterations: int = 0) -> float:
         """Minimise in place (L-BFGS until converged when 0) and return the energy in kJ/mol.
 
-        Raises SimulationError when the energy is not finite, as with atoms on top of each other, and PreparationError
-        where quantum forces lead to another molecule.
+        Raises SimulationError when the energy is not finite, and PreparationError where quantum forces lead to another
+        molecule.
         """
         import openmm
 
@@ -223,10 +210,6 @@ class Engine:
         if self._keeps_momentum:
             self.set_velocities(self._of_atoms(self._query(velocities=True).getVelocities(asNumpy=True)))
 
-    def reset_clock(self) -> None:
-        self._context.setTime(0.0)
-        self._context.setStepCount(0)
-
     def step(self, n_steps: int) -> None:
         """Integrate. Raises SimulationError when OpenMM itself notices that coordinates are no longer finite."""
         with _openmm_errors("integration failed"):
@@ -241,12 +224,11 @@ class Engine:
         return np.asarray(values._value, dtype=np.float64)[: self.scene.n_atoms]
 
     def state(self, *, velocities: bool = False, forces: bool = False) -> State:
-        """Return positions, energies, time and kinetic temperature, and what else is asked for.
+        """Return positions, energies and kinetic temperature, and what else is asked for.
 
         With a bath, velocities are those of half steps (Zhang et al., J. Phys. Chem. A 123, 6056 (2019)), and so is the
-        temperature; without one they belong to the time of the positions. Raises SimulationError for a state that is
-        not finite, or hotter than the bath can make it (`hottest_k`). A model system without a bath may be as hot as it
-        likes.
+        temperature. Raises SimulationError for a state that is not finite, or hotter than the bath can make it
+        (`hottest_k`); a model system without a bath may be as hot as it likes.
         """
         # The Langevin middle integrator leaves in its velocities half of each step's noise along the constrained bonds,
         # and projects it out after the next kick. Seen as temperature it would be n_constraints / (4 n_dof) of
@@ -261,7 +243,6 @@ class Engine:
             positions_nm=self._of_atoms(raw.getPositions(asNumpy=True)),
             potential_kj_mol=float(raw.getPotentialEnergy()._value),
             kinetic_kj_mol=kinetic,
-            time_ps=float(raw.getTime()._value),
             temperature_k=2.0 * kinetic / (max(self.n_dof, 1) * GAS_CONSTANT_KJ_MOL_K),
             velocities_nm_ps=self._of_atoms(raw.getVelocities(asNumpy=True)) if velocities else None,
             forces_kj_mol_nm=self._of_atoms(raw.getForces(asNumpy=True)) if forces else None,
@@ -274,7 +255,7 @@ class Engine:
             raise SimulationError(f"the system blew up (kinetic temperature {state.temperature_k:.3g} K)")
         return state
 
-    def _query(self, **what: bool) -> Any:
+    def _query(self, **what: Any) -> Any:
         """Return OpenMM's State; some platforms notice here that coordinates are no longer finite."""
         with _openmm_errors("evaluation failed"):
             return self._context.getState(**what)
@@ -291,11 +272,6 @@ class Engine:
     def close(self) -> None:
         """Free the Context. The engine cannot be used afterwards."""
         self._context = None
-
-
-def integrator_name(ensemble: str) -> str:
-    """Return the name that records have for the integrator of an ensemble."""
-    return "VelocityVerlet" if ensemble == "nve" else "LangevinMiddle"
 
 
 def _velocity_verlet(timestep_ps: float, *, constrained: bool) -> Any:
@@ -329,63 +305,38 @@ class Relaxed:
     potential_kj_mol: float
 
 
-class Relaxer:
-    """One Context with a spring on each atom. Use as a context manager or call `close`. `system`: an OpenMM System of
-    `scene` as `build_system` returns it; it is copied. Raises SimulationError when the platform cannot run it."""
+class Relaxer(Engine):
+    """An engine with a spring on each atom. `system`: as `build_system` returns it; it is copied."""
 
     def __init__(self, scene: Scene, system: Any, *, platform: str = "auto", born: bool = True) -> None:
         import openmm
 
-        self._n_atoms, self._system = scene.n_atoms, openmm.XmlSerializer.clone(system)
+        held = openmm.XmlSerializer.clone(system)
         self._springs = openmm.CustomExternalForce("0.5*k*((x-x0)^2+(y-y0)^2+(z-z0)^2)")
         self._springs.addGlobalParameter("k", _SPRING_KJ_MOL_NM2)
         for name in ("x0", "y0", "z0"):
             self._springs.addPerParticleParameter(name)
-        for k in range(self._n_atoms):
+        for k in range(scene.n_atoms):
             self._springs.addParticle(k, [0.0, 0.0, 0.0])
         self._springs.setForceGroup(_SPRINGS_GROUP)
-        self._system.addForce(self._springs)
-        self._integrator = openmm.VerletIntegrator(0.001)
-        choice = choose_platform(scene.n_atoms, platform, born=born)
-        with _openmm_errors(f"platform {choice.name} cannot run {scene.name!r}"):
-            self._context: Any = make_context(self._system, self._integrator, choice.name, choice.threads)
+        held.addForce(self._springs)
+        # Of the forces only whether they have a Born term matters here, for the choice of a platform.
+        spec = ForceFieldSpec("auto", "auto" if born else "vacuum")
+        super().__init__(scene, Conditions(force=spec, platform=platform), system=held)
 
     def relax(self, positions_nm: npt.ArrayLike) -> Relaxed:
-        """Restore constrained bonds exactly, then minimise under the springs until converged. Raises SimulationError
-        where the energy is not finite before or after, as with atoms on top of each other."""
-        import openmm
-
+        """Restore constrained bonds exactly, then minimise under the springs. Raises SimulationError where the energy
+        is not finite before or after."""
         start = np.asarray(positions_nm, dtype=np.float64)
         if not np.isfinite(start).all():
             raise SimulationError("a frame that is not finite cannot be relaxed")
         for k, at in enumerate(start.tolist()):
             self._springs.setParticleParameters(k, k, at)
-        virtual = np.zeros((self._system.getNumParticles() - self._n_atoms, 3))
         with _openmm_errors("relaxation failed"):
             self._springs.updateParametersInContext(self._context)
-            self._context.setPositions(np.concatenate([start, virtual]))
-            self._context.computeVirtualSites()
-            if not math.isfinite(self._potential()):
+            if not math.isfinite(self.energy(start)):
                 raise SimulationError("the energy of a frame to relax is not finite; atoms lie on top of each other")
             self._context.applyConstraints(_CONSTRAINT_TOLERANCE)
-            openmm.LocalEnergyMinimizer.minimize(self._context)
-            raw = self._context.getState(positions=True)
-        relaxed = np.asarray(raw.getPositions(asNumpy=True)._value, dtype=np.float64)[: self._n_atoms]
-        energy = self._potential()
-        if not (math.isfinite(energy) and np.isfinite(relaxed).all()):
-            raise SimulationError("relaxation failed: coordinates or energy are no longer finite")
-        return Relaxed(relaxed, energy)
-
-    def _potential(self) -> float:
-        raw = self._context.getState(energy=True, groups=~(1 << _SPRINGS_GROUP) & 0xFFFFFFFF)
-        return float(raw.getPotentialEnergy()._value)
-
-    def close(self) -> None:
-        """Free the Context. The relaxer cannot be used afterwards."""
-        self._context = None
-
-    def __enter__(self) -> Relaxer:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
+            self.minimise()
+        without_springs = self._query(energy=True, groups=~(1 << _SPRINGS_GROUP) & 0xFFFFFFFF)
+        return Relaxed(self.positions(), float(without_springs.getPotentialEnergy()._value))

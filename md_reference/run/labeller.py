@@ -53,8 +53,7 @@ _worker: Potential | None = None
 @dataclass(frozen=True, eq=False)
 class Labels:
     """States `positions_nm` (n, n_atoms, 3) with their energies (n,) in kJ/mol and forces (n, n_atoms, 3) in kJ/mol/nm;
-    `failed`: how many more were asked for, at which the reference finds no answer; `rearranged`: those that are another
-    molecule, at which it was not asked."""
+    `failed`: how many more the reference has no answer for; `rearranged`: those that are another molecule."""
 
     positions_nm: FloatArray
     energies_kj_mol: FloatArray
@@ -116,8 +115,7 @@ class Labeller:
 
     def explore(self, n_states: int, temperatures_k: Sequence[float], *, seed: int) -> FloatArray:
         """Return states `(n, n_atoms, 3)` nm of hot MD by GAFF2, or by GFN2-xTB where GAFF2 has no parameters and of
-        water, which is rigid beside it; of every third one torsion is turned. They are near the molecule's own, and as
-        many at each temperature."""
+        water, which is rigid beside it; as many at each temperature, of every third one torsion turned."""
         rng = np.random.default_rng(seed)
         each, apart_ps = -(-n_states // len(temperatures_k)), self._cheap[2].apart_ps
         states = np.concatenate([self._md(each, apart_ps, t, seed=int(rng.integers(2**31))) for t in temperatures_k])

@@ -1,10 +1,12 @@
-"""Plan of a reference run: what it will compute, what it leaves out and why, and what that saves on this machine."""
+"""Plan of a reference run: what it will compute, what it leaves out and why, and how long a step takes here."""
 
 from __future__ import annotations
 
 import math
 import time
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -15,71 +17,41 @@ from md_reference.forces.nonstandard import find_chain
 from md_reference.forces.spec import MODEL, QUANTUM, ForceFieldSpec
 from md_reference.run.config import SIMD, MDConfig, resolved
 from md_reference.run.engine import Engine
-from md_reference.run.machine import (
-    PlatformChoice,
-    available_cores,
-    choose_platform,
-    measured_platform,
-    simd_choice,
-    time_steps,
-)
+from md_reference.run.machine import PlatformChoice, available_cores, platform_for, simd_choice
 from md_reference.simd.force_field import SimdReplicas, n_replicas
 from systems.errors import SimulationError
 from systems.scene import Scene, part_of
-from systems.units import format_time_ps, format_wall
+from systems.units import format_wall
 
 # Above this step a hydrogen of natural mass is integrated badly even with its bond constrained.
 _LONGEST_NATURAL_STEP_PS = 0.0025
-_TIMED_S = 0.3
-
-
-@dataclass(frozen=True)
-class Skip:
-    """Something a general MD program would do and this run does not: why that is exact, and what it saves."""
-
-    what: str
-    why: str
-    saves: str = ""
+# A short step stands the starting positions, and takes as long as any.
+_TIMED_STEP_PS = 0.001
+_TIMED_S, _BATCH_S = 0.3, 0.02
 
 
 @dataclass(frozen=True)
 class Plan:
-    """A run before it starts. `terms` counts the interactions of each force; what was not measured is None.
+    """A run before it starts, in one `line` and in `rows`; what was not measured is None.
 
-    `wall_s`: seconds for all replicas of the asked length, equilibration included, if the cores are free. `line` says
-    it all in one; `timings` is the table the platform was chosen by.
+    `wall_s`: seconds for all replicas of the asked length, equilibration included, if the cores are free. `skipped`:
+    what a general MD program would do and this run does not, and why, or what it saves.
     """
 
     line: str
-
-    scene: str
-    formula: str
-    n_atoms: int
-    force_field: str
-    solvent: str
-    integrator: str
-    platform: str
-    platform_reason: str
-    timings: tuple[dict[str, Any], ...]
-    threads: int
-    parallel: str
-    hydrogen_mass: str
-    constraints: str
-    terms: dict[str, int]
+    rows: dict[str, str | int]
     us_per_step: float | None
     ns_per_day: float | None
-    length: str | None
     wall_s: float | None
-    skipped: tuple[Skip, ...]
+    skipped: dict[str, str]
     warnings: tuple[str, ...]
 
 
 def make_plan(scene: Scene, config: MDConfig, *, replicas: int = 1, timed: bool = True) -> Plan:
     """Return the plan of a run with these settings; one whose `time_ps` is 0 has no length yet.
 
-    The platform is the one that `reference` would measure. Steps are timed as planned and on the CPU platform, unless
-    nothing is to be `timed`: then the size of the scene decides.
-    Raises PreparationError (no parameters), UnknownNameError (platform), SimulationError (the scene cannot be stepped).
+    Steps are timed as planned and on the CPU platform, unless nothing is to be `timed`. Raises PreparationError (no
+    parameters), UnknownNameError (platform), SimulationError (the scene cannot be stepped).
     """
     config = resolved(scene, config)
     spec = config.force
@@ -91,13 +63,14 @@ def make_plan(scene: Scene, config: MDConfig, *, replicas: int = 1, timed: bool 
     if by_simd:
         choice = simd_choice()
         if timed:
-            planned = _time_simd_s(scene, config, system) / min(replicas, n_replicas())
-    elif timed:
-        each = max(1, cores // side_by_side)
-        choice = measured_platform(scene, config, max_threads=each, side_by_side=side_by_side, system=lambda: system)
-        planned, default = _time_openmm_s(scene, config, system, choice)
+            planned = _simd_step_s(scene, config, system) / min(replicas, n_replicas())
     else:
-        choice = choose_platform(scene.n_atoms, config.platform, born=spec.solvent != "vacuum")
+        choice = platform_for(scene, config, max_threads=max(1, cores // side_by_side))
+        if timed:
+            planned = _openmm_step_s(scene, config, system, choice.name, choice.threads)
+        if timed and choice.name != "CPU" and spec.force_field not in (QUANTUM, MODEL):
+            with suppress(SimulationError):
+                default = _openmm_step_s(scene, config, system, "CPU", 1)
     threads = "one thread" if choice.threads == 1 else f"{choice.threads} threads"
     parallel = f"one replica, {threads}"
     if by_simd:
@@ -105,39 +78,52 @@ def make_plan(scene: Scene, config: MDConfig, *, replicas: int = 1, timed: bool 
     elif replicas > 1:
         parallel = f"{replicas} replicas, {side_by_side} side by side, one process and {threads} each"
     heavy = spec.hydrogen_mass_da
+    rows: dict[str, str | int] = {
+        "scene": scene.name,
+        "formula": scene.formula,
+        "n_atoms": scene.n_atoms,
+        "force_field": spec.force_field,
+        "solvent": spec.solvent,
+        "integrator": _integrator(config),
+        "platform": choice.name,
+        "platform_reason": choice.reason,
+        "threads": choice.threads,
+        "parallel": parallel,
+        "hydrogen_mass": "natural" if heavy is None else f"{heavy:g} Da, taken from the atom it is bonded to",
+        "constraints": f"{n_constraints} bonds to hydrogen" if n_constraints else "none",
+    }
     return Plan(
         line=plan_line(scene, config, choice, step_s=planned, replicas=replicas),
-        scene=scene.name,
-        formula=scene.formula,
-        n_atoms=scene.n_atoms,
-        force_field=spec.force_field,
-        solvent=spec.solvent,
-        integrator=_integrator(config),
-        platform=choice.name,
-        platform_reason=choice.reason,
-        timings=tuple(asdict(timing) for timing in choice.timings),
-        threads=choice.threads,
-        parallel=parallel,
-        hydrogen_mass="natural" if heavy is None else f"{heavy:g} Da, taken from the atom it is bonded to",
-        constraints=f"{n_constraints} bonds to hydrogen" if n_constraints else "none",
-        terms=_terms(system),
+        rows=rows,
         us_per_step=None if planned is None else planned * 1e6,
         ns_per_day=None if planned is None else _ns_per_day(config, planned),
-        length=format_time_ps(config.time_ps) if config.time_ps else None,
         wall_s=_wall_s(config, replicas, planned),
-        skipped=_skips(scene, config, n_constraints, planned, default),
+        skipped=_skipped(scene, config, n_constraints, planned, default),
         warnings=(*spec.warnings, *_warnings(scene, spec, config.timestep_ps)),
     )
 
 
-def _time_simd_s(scene: Scene, config: MDConfig, system: Any) -> float:
-    """Return the seconds of processor time of one step of all replicas, the fastest of all batches measured. Raises
-    SimdUnavailableError, and SimulationError where the replicas differ from OpenMM or cannot be stepped."""
+def _fastest_s(step: Callable[[int], None], clock: Callable[[], float]) -> float:
+    """Return the seconds of one step, the fastest of all batches measured."""
+    step(1)  # kernels are compiled, neighbour lists built
+    fastest, n, began = math.inf, 1, time.perf_counter()
+    while math.isinf(fastest) or time.perf_counter() - began < _TIMED_S:
+        start = clock()
+        step(n)
+        took = max(clock() - start, 1e-9)
+        fastest = min(fastest, took / n)
+        n = max(1, min(2 * n, round(n * _BATCH_S / took)))
+    return fastest
+
+
+def _simd_step_s(scene: Scene, config: MDConfig, system: Any) -> float:
+    """Return the seconds of processor time of one step of all replicas. Raises SimdUnavailableError, and
+    SimulationError where the replicas differ from OpenMM or cannot be stepped."""
     run = SimdReplicas(
         system,
         temperature_k=config.temperature_k,
         friction_per_ps=config.friction_per_ps,
-        timestep_ps=min(config.timestep_ps, 0.001),
+        timestep_ps=min(config.timestep_ps, _TIMED_STEP_PS),
         seed=config.seed,
     )
     platform = "Reference" if scene.cell_nm is None else "CPU"
@@ -146,27 +132,24 @@ def _time_simd_s(scene: Scene, config: MDConfig, system: Any) -> float:
         relaxed_nm = engine.positions()
     run.check(system, relaxed_nm)
     run.set_positions(np.repeat(relaxed_nm[None], run.n_replicas, axis=0))
-    run.step(20)
-    fastest, began = math.inf, time.perf_counter()
-    while math.isinf(fastest) or time.perf_counter() - began < _TIMED_S:
-        start = time.process_time()
-        run.step(100)
-        fastest = min(fastest, (time.process_time() - start) / 100)
-    return fastest
+    return _fastest_s(run.step, time.process_time)
 
 
-def _time_openmm_s(scene: Scene, config: MDConfig, system: Any, choice: PlatformChoice) -> tuple[float, float | None]:
-    """Return the seconds of one step on the platform chosen, and on a thread of the CPU platform where that is another
-    one and might run it. Raises SimulationError where the scene cannot be stepped."""
-    chosen, usual = (choice.name, choice.threads), ("CPU", 1)
-    others = [usual] if usual != chosen and config.force.force_field not in (QUANTUM, MODEL) else []
-    fresh = time_steps(scene, config, [chosen, *others], system)
-    timings = {(t.platform, t.threads): t for t in (*choice.timings, *fresh)}
-    planned, default = timings[chosen], timings.get(usual) if others else None
-    if planned.us_per_step is None:
-        raise SimulationError(f"platform {choice.name} cannot run {scene.name!r}: {planned.note}")
-    us = None if default is None else default.us_per_step
-    return planned.us_per_step * 1e-6, None if us is None else us * 1e-6
+def _openmm_step_s(scene: Scene, config: MDConfig, system: Any, platform: str, threads: int) -> float:
+    """Return the seconds of one step: processor time where it is that of one core, which other work on the machine does
+    not lengthen, else wall time. Raises SimulationError where the scene cannot be stepped."""
+    short = replace(config, platform=platform, ensemble="nvt", timestep_ps=min(config.timestep_ps, _TIMED_STEP_PS))
+    with Engine(scene, short, threads=threads, system=system) as engine:
+        engine.minimise(max_iterations=50)
+        engine.thermalise()
+        if platform in ("Reference", "CPU"):
+            return _fastest_s(engine.step, time.process_time if threads == 1 else time.perf_counter)
+
+        def step(n: int) -> None:
+            engine.step(n)
+            engine.energy()  # a device works on after `step` has returned
+
+        return _fastest_s(step, time.perf_counter)
 
 
 def _ns_per_day(config: MDConfig, step_s: float) -> float:
@@ -196,13 +179,9 @@ def plan_line(
 ) -> str:
     """Return the plan in one line: what runs on what, what is left out, and how long it takes where that is known.
 
-    `config`: `resolved`. `step_s`: seconds of a step, by the timing that chose the platform where it is not given;
-    `replicas`: for how many the wall time is stated, 0 for no such time.
+    `config`: `resolved`. `step_s`: seconds of a step; `replicas`: for how many the wall time is stated, 0 for no such
+    time.
     """
-    if step_s is None:
-        chosen = (t.us_per_step for t in choice.timings if (t.platform, t.threads) == (choice.name, choice.threads))
-        timed = next(chosen, None)
-        step_s = None if timed is None else timed * 1e-6
     wall_s = _wall_s(config, replicas, step_s)
     spec = config.force
     threads = "1 thread" if choice.threads == 1 else f"{choice.threads} threads"
@@ -223,50 +202,36 @@ def plan_line(
     return "; ".join(parts)
 
 
-def _terms(system: Any) -> dict[str, int]:
-    counted = {"HarmonicBondForce": "Bonds", "HarmonicAngleForce": "Angles", "PeriodicTorsionForce": "Torsions",
-               "CMAPTorsionForce": "Torsions", "NonbondedForce": "Particles", "GBSAOBCForce": "Particles"}  # fmt: skip
-    names = {force.getName(): force for force in system.getForces()}
-    return {
-        name: int(getattr(force, f"getNum{counted[name]}")()) if name in counted else 1 for name, force in names.items()
-    }
-
-
-def _skips(
+def _skipped(
     scene: Scene, config: MDConfig, n_constraints: int, planned: float | None, default: float | None
-) -> tuple[Skip, ...]:
+) -> dict[str, str]:
     ensemble, solvent = config.ensemble, config.force.solvent
-    skips: list[tuple[str, ...]] = []
+    skipped: dict[str, str] = {}
     if scene.cell_nm is None:
-        why = "the scene has no periodic cell; all pairs are computed exactly"
-        skips += [("periodic box, PME, neighbour lists", why), ("barostat", "there is no volume to control")]
-    elif ensemble != "npt":
-        skips.append(("barostat", f"the ensemble is {ensemble}; npt has one"))
-    why = "the Langevin bath acts on it like on everything else"
+        skipped["periodic box, PME, neighbour lists"] = "the scene has no periodic cell; all pairs are computed exactly"
+    if ensemble != "npt":
+        skipped["barostat"] = f"the ensemble is {ensemble}"
+    rest = "the Langevin bath acts on it like on everything else"
     if ensemble == "nve":
-        skips.append(("thermostat", "the ensemble is nve"))
-        own = scene.interactions is not None
-        why = "it is part of the model system" if own else "it is put at rest once and stays there"
-    skips.append(("removal of centre-of-mass motion", why))
+        skipped["thermostat"] = "the ensemble is nve"
+        rest = "it is put at rest once and stays there"
+    skipped["removal of centre-of-mass motion"] = rest
     if not config.save_velocities:
-        skips.append(("velocities on disk", "nobody asked for them (`save_velocities=True`)", "half of the file"))
+        skipped["velocities on disk"] = "nobody asked for them (`save_velocities=True`): half of the file"
     kept = config.kept_atoms(scene)
     if kept is not None:
         share = f"{1 - len(kept) / scene.n_atoms:.0%} of the file"
-        skips.append(("water and ions on disk", "it is simulated and not kept (`keep='all'` keeps it)", share))
-    skips.append(("energies and copies between saved frames", "nobody keeps them"))
+        skipped["water and ions on disk"] = f"simulated and not kept (`keep='all'` keeps it): {share}"
     if solvent == "vacuum":
-        skips.append(("generalised Born term", "the solvent is vacuum"))
+        skipped["generalised Born term"] = "the solvent is vacuum"
     elif solvent == "obc2":
-        why = "the native GBSAOBCForce has the same energies and forces"
-        skips.append(("CustomGBForce of implicit/obc2.xml", why))
+        skipped["CustomGBForce of implicit/obc2.xml"] = "the native GBSAOBCForce has the same energies and forces"
     if n_constraints == 0:
-        why = "there is no hydrogen" if "H" not in scene.elements else "bonds to hydrogen move freely here"
-        skips.append(("constraints", why))
+        skipped["constraints"] = "no bond to hydrogen is rigid"
     if planned is not None and default is not None:
-        saves = f"{default * 1e6:.0f} -> {planned * 1e6:.0f} µs a step, {default / planned:.1f} times faster"
-        skips.append(("OpenMM's CPU platform", "timed here, on one thread", saves))
-    return tuple(Skip(*skip) for skip in skips)
+        times = f"{default * 1e6:.0f} -> {planned * 1e6:.0f} µs a step, {default / planned:.1f} times faster"
+        skipped["OpenMM's CPU platform"] = f"timed here, on one thread: {times}"
+    return skipped
 
 
 def _warnings(scene: Scene, spec: ForceFieldSpec, timestep_ps: float) -> tuple[str, ...]:

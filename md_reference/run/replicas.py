@@ -1,22 +1,17 @@
 """Several independent replicas of one run: one process and one thread each, or up to sixteen at once in one core's
-vector registers (`md_reference.simd`).
-
-Files, records, equilibration and resuming are those of `run.simulate`; of replicas in one core one checkpoint, beside
-the first file, stands for all.
-"""
+vector registers (`md_reference.simd`), whose one checkpoint lies beside the first file."""
 
 from __future__ import annotations
 
 import math
 import multiprocessing
 import os
-import queue
 import time
 from collections.abc import Callable, Sequence
-from contextlib import ExitStack
-from dataclasses import dataclass, replace
+from contextlib import ExitStack, suppress
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -24,19 +19,16 @@ import numpy.typing as npt
 from md_reference.forces.forcefield import build_system
 from md_reference.run.config import SIMD, MDConfig, check_run
 from md_reference.run.engine import Engine, refuse_damaged
-from md_reference.run.machine import available_cores, measured_platform, simd_choice
+from md_reference.run.machine import available_cores, platform_for, simd_choice
 from md_reference.run.plan import plan_line
 from md_reference.run.simulate import ProgressFn, StoredRun, already_complete, record_of, report_preparing, simulate
 from md_reference.run.starts import many_starts
 from md_reference.simd.force_field import SimdReplicas, n_replicas
 from systems.errors import InputError, SimulationError, SurromdError
 from systems.interrupts import deferred_interrupt, end_with_parent
-from systems.scene import Scene
+from systems.scene import FloatArray, Scene
 from systems.trajectory.base import TrajectoryWriter
-from systems.trajectory.checkpoint import Checkpoint, checkpoint_path, locked_outputs, supported_checkpoint, writer_at
-
-# Frames are computed for about so long, then written and checkpointed.
-_BLOCK_S = 2.0
+from systems.trajectory.checkpoint import checkpoint_path, locked_outputs, supported_checkpoint, writer_at
 
 
 def simulate_batch(
@@ -53,12 +45,10 @@ def simulate_batch(
     """Run a replica for each of `outs`, at most `n_replicas()`; all have `config.seed` and their number in the batch.
 
     They start from the scene, its energy minimised, or from `starts_nm` (n, n_atoms, 3) as they stand; `notes` are
-    added to their records.
-
-    Frames and checkpoint are written about every two seconds; `resume` goes on from there, as it would have gone on.
-    Ctrl-C and SIGTERM stop with a checkpoint: KeyboardInterrupt. `progress` counts the frames of all replicas.
-    Raises SimdUnavailableError for what the platform cannot do, SimulationError when a replica blows up (the frames
-    before stay in the files, which say `completed: false`), and what `simulate` raises for settings and files.
+    added to their records. Frames and checkpoint are written about every two seconds; `resume` goes on from there, as
+    it would have gone on. `progress` counts the frames of all replicas. Raises SimdUnavailableError for what the
+    platform cannot do, SimulationError when a replica blows up (the frames before stay in the files, which say
+    `completed: false`), and what `simulate` raises.
     """
     config = check_run(scene, config, outs[0])
     if config.ensemble != "nvt" or config.columns:
@@ -72,8 +62,8 @@ def simulate_batch(
                 already_complete(out, config)
             return
         kept = supported_checkpoint(state_path, list(outs)) if resume and state_path.exists() else None
-        batch = _Batch(scene, config, outs, kept, overwrite=overwrite)
-        batch.start(starts_nm, asked_to_stop, progress)
+        batch = _Batch(scene, config, outs, kept, overwrite=overwrite, asked_to_stop=asked_to_stop, progress=progress)
+        batch.start(starts_nm)
         record = record_of(scene, config, simd_choice())
         with ExitStack() as stack:
             writers = []
@@ -81,94 +71,64 @@ def simulate_batch(
                 own = {**record, "replica": k, "of_replicas": len(outs), **(notes[k] if notes else {})}
                 writer = writer_at(out, batch.written, own, batch.header, k, resumed=batch.resumed)
                 writers.append(stack.enter_context(writer))
-            batch.produce(writers, asked_to_stop, progress)
+            batch.produce(writers)
         state_path.unlink(missing_ok=True)
 
 
 class _Batch(StoredRun):
     """Replicas in the vector registers of one core."""
 
-    def __init__(
-        self, scene: Scene, config: MDConfig, outs: Sequence[Path], kept: Checkpoint | None, *, overwrite: bool
-    ) -> None:
-        super().__init__(scene, config, outs, kept, overwrite=overwrite)
-        self.system = build_system(scene, config.force)
-        bath: dict[str, Any] = {"temperature_k": config.temperature_k, "friction_per_ps": config.friction_per_ps}
-        self.simd = SimdReplicas(self.system, **bath, timestep_ps=config.timestep_ps, seed=config.seed)
+    block_s = 2.0
+    others = " and each other file of this batch"
 
-    def start(
-        self, starts_nm: npt.NDArray[np.floating] | None, asked_to_stop: Callable[[], bool],
-        progress: ProgressFn | None,
-    ) -> None:  # fmt: skip
-        """Go to where the batch was left, or to the starts, and equilibrate. Raises SimulationError,
-        KeyboardInterrupt."""
+    def start(self, starts_nm: npt.NDArray[np.floating] | None) -> None:
+        """Go to where the batch was left, or to the starts, and equilibrate. Raises SimulationError."""
+        config, system = self.config, build_system(self.scene, self.config.force)
+        bath: dict[str, Any] = {"temperature_k": config.temperature_k, "friction_per_ps": config.friction_per_ps}
+        self.simd = SimdReplicas(system, **bath, timestep_ps=config.timestep_ps, seed=config.seed)
+        self.n_dof = self.simd.n_dof
         if self.resumed:
             self.simd.restore(self.blob)
             return
-        report_preparing(progress, 0.0)
+        report_preparing(self.progress, 0.0)
         if starts_nm is None:
             # The Reference platform has no neighbour lists.
             platform = "Reference" if self.scene.cell_nm is None else "CPU"
-            with Engine(self.scene, replace(self.config, platform=platform), system=self.system) as engine:
+            with Engine(self.scene, replace(config, platform=platform), system=system) as engine:
                 engine.minimise()
                 starts_nm = engine.positions()[None]
                 refuse_damaged(self.scene, starts_nm[0])
-        self.simd.check(self.system, starts_nm[0])
+        self.simd.check(system, starts_nm[0])
         # Replicas left over repeat the last start; they cost nothing and are not kept.
         self.simd.set_positions(starts_nm[np.minimum(np.arange(self.simd.n_replicas), len(starts_nm) - 1)])
         self.simd.thermalise()
-        n_steps = math.ceil(round(self.config.equilibrate_ps / self.config.timestep_ps, 6))
+        n_steps = math.ceil(round(config.equilibrate_ps / config.timestep_ps, 6))
         piece = max(1, min(1000, n_steps))
         for done in range(0, n_steps, piece):
-            if asked_to_stop():
+            if self.asked_to_stop():
                 raise KeyboardInterrupt
             self.simd.step(min(piece, n_steps - done))
-            report_preparing(progress, min(1.0, (done + piece) / n_steps))
+            report_preparing(self.progress, min(1.0, (done + piece) / n_steps))
         self.save()
 
     def save(self) -> None:
         self.keep(self.simd.checkpoint(), platform=SIMD)
 
-    def produce(
-        self, writers: Sequence[TrajectoryWriter], asked_to_stop: Callable[[], bool], progress: ProgressFn | None
-    ) -> None:
-        """Append frames until all are there. Raises SimulationError, StorageError, KeyboardInterrupt."""
-        config, n = self.config, len(writers)
-        while self.done < config.n_frames:
-            frames, failure = self._frames(asked_to_stop)
-            if frames:
-                positions, energies, temperatures = (np.stack(x, axis=1) for x in zip(*frames, strict=True))
-                cell = self.scene.cell_nm
-                cells = None if cell is None else np.repeat(cell[None], len(frames), axis=0)
-                times = (self.done + 1 + np.arange(len(frames))) * config.save_every_ps
-                for k, writer in enumerate(writers):
-                    scalars = {"potential_kj_mol": energies[k], "temperature_k": temperatures[k]}
-                    writer.append(positions[k], times, scalars=scalars, cell_nm=cells)
-                self.written_so_far(writers, len(frames))
-            where = f"{self.outs[0]} and each other file of this batch."
-            self.refuse_failed(failure, writers, where)
-            if self.done < config.n_frames:
-                self.save()
-            if progress is not None:
-                progress(n * self.done, n * config.n_frames)
-            if asked_to_stop() and self.done < config.n_frames:
-                self.stop(writers)
-        self.finish(writers, self.simd.n_dof)
+    def frame(self) -> tuple[npt.NDArray[np.float32], FloatArray, FloatArray] | None:
+        """Return positions, energies and temperatures of all replicas."""
+        if self.asked_to_stop():
+            return None
+        self.simd.step(self.config.steps_per_frame)
+        positions = self.simd.positions_nm[:, self.atoms].astype(np.float32)
+        return positions, self.simd.energies(), self.simd.temperatures_k()
 
-    def _frames(self, asked_to_stop: Callable[[], bool]) -> tuple[list[tuple[Any, Any, Any]], str]:
-        """Return the frames of the next seconds, each positions, energies and temperatures of all replicas."""
-        found: list[tuple[Any, Any, Any]] = []
-        until = time.monotonic() + _BLOCK_S
-        while self.done + len(found) < self.config.n_frames and not (found and time.monotonic() > until):
-            if asked_to_stop() and found:
-                break
-            try:
-                self.simd.step(self.config.steps_per_frame)
-            except SimulationError as error:
-                return found, str(error)
-            positions = self.simd.positions_nm[:, self.atoms].astype(np.float32)
-            found.append((positions, self.simd.energies(), self.simd.temperatures_k()))
-        return found, ""
+    def append(self, writers: Sequence[TrajectoryWriter], frames: Sequence[Any], times_ps: npt.ArrayLike) -> None:
+        positions, energies, temperatures = (np.stack(x, axis=1) for x in zip(*frames, strict=True))
+        cell = self.scene.cell_nm
+        cells = None if cell is None else np.repeat(cell[None], len(frames), axis=0)
+        for k, writer in enumerate(writers):
+            scalars = {"potential_kj_mol": energies[k], "temperature_k": temperatures[k]}
+            writer.append(positions[k], times_ps, scalars=scalars, cell_nm=cells)
 
 
 # ---- processes ------------------------------------------------------------------------------------------------------
@@ -176,15 +136,6 @@ class _Batch(StoredRun):
 
 # The exit status of a process that would start replicas while it imports the script which has started it.
 _UNGUARDED = 79
-
-
-@dataclass(frozen=True)
-class _Board:
-    """What processes write and their parent reads: frames done, shares equilibrated (both by process), last words."""
-
-    done: Any
-    equilibrated: Any
-    errors: Any
 
 
 def simulate_replicas(
@@ -201,13 +152,12 @@ def simulate_replicas(
     """Run `len(outs)` replicas with seeds config.seed, config.seed + 1, ..., at most one per core at a time.
 
     `scene`: what they start from, each from a state of its own unless `config.starts` is one (`starts.many_starts`); or
-    a start for each replica. Each replica is a process with its share of the cores, one thread where there are as many
-    replicas as cores: on small scenes the fastest use of them. On platform simd up to sixteen replicas share a process.
-    The platform is measured once, for all, and `announce` gets the plan in one line, and the error of a replica that
-    fails while others run, which it may raise to end them too; `progress` counts the frames of all replicas. Ctrl-C and
-    SIGTERM stop them all with checkpoints: KeyboardInterrupt. When this process is killed outright they stop by
-    themselves. Raises InputError for a script that starts them outside `if __name__ == '__main__':`, SimulationError
-    with the first replica's reason when the others have ended; finished replicas stay on disk.
+    a start for each replica. Each is a process with its share of the cores; on platform simd up to sixteen share a
+    process. `announce` gets the plan in one line, and the error of a replica that fails while others run, which it may
+    raise to end them too; `progress` counts the frames of all replicas. Ctrl-C and SIGTERM stop them all with
+    checkpoints: KeyboardInterrupt; without this process they stop by themselves. Raises InputError for a script that
+    starts them outside `if __name__ == '__main__':`, SimulationError with the first replica's reason when the others
+    have ended.
     """
     if getattr(multiprocessing.current_process(), "_inheriting", False):
         raise SystemExit(_UNGUARDED)  # this is one of the processes, which has not come further than the user's script
@@ -224,7 +174,7 @@ def simulate_replicas(
     if fresh:
         if config.platform != SIMD:
             each = max(1, available_cores() // width)
-            choice = measured_platform(scene, config, max_threads=each, side_by_side=width)
+            choice = platform_for(scene, config, max_threads=each)
         if announce is not None:
             announce(plan_line(scene, config, choice or simd_choice(), replicas=len(outs)))
     scenes = [scene] * len(outs) if given is None else given
@@ -244,31 +194,39 @@ def simulate_replicas(
         _run(*job(0), progress)
         return list(outs)
     context = multiprocessing.get_context("spawn")
-    # Without a lock, which a killed process would never give back: each number has one writer.
-    board = _Board(context.Array("Q", len(jobs), lock=False), context.Array("d", len(jobs), lock=False),
-                   context.Queue())  # fmt: skip
     waiting = list(range(len(jobs)))
-    running: dict[int, Any] = {}
-    failures: dict[int, str] = {}
-    reasons: dict[int, str] = {}
+    running: dict[int, tuple[Any, Any]] = {}
+    # Of each job, by its process: frames done, share equilibrated, the reason why it failed.
+    said: list[dict[str, Any]] = [{} for _ in jobs]
+
+    def error() -> SimulationError | None:
+        failed = [k for k, words in enumerate(said) if "failed" in words]
+        if not failed:
+            return None
+        reason = f"replica {jobs[failed[0]][0]}: {said[failed[0]]['failed']}"
+        return SimulationError(f"{sum(len(jobs[k]) for k in failed)} of {len(outs)} replicas failed; {reason}")
+
     with deferred_interrupt() as asked_to_stop:
         try:
             while waiting or running:
                 while waiting and len(running) < width:
                     k = waiting.pop(0)
-                    process = context.Process(target=_replicas, args=(*job(k), board, k), name=f"replica-{jobs[k][0]}")
+                    pipe, end = context.Pipe(duplex=False)
+                    process = context.Process(target=_replicas, args=(*job(k), end), name=f"replica-{jobs[k][0]}")
                     process.start()
-                    running[k] = process
+                    end.close()
+                    running[k] = process, pipe
                 time.sleep(0.1)
                 if asked_to_stop():
                     raise KeyboardInterrupt
-                n_done = int(sum(board.done[:]))
-                if n_done == 0:
-                    report_preparing(progress, sum(board.equilibrated[:]) / len(jobs))
-                elif progress is not None:
-                    progress(n_done, config.n_frames * len(outs))
-                for k in [k for k, process in running.items() if not process.is_alive()]:
-                    process = running.pop(k)
+                for k, (process, pipe) in list(running.items()):
+                    is_over = not process.is_alive()
+                    with suppress(EOFError, OSError):
+                        while pipe.poll():
+                            said[k].update([pipe.recv()])
+                    if not is_over:
+                        continue
+                    del running[k]
                     process.join()
                     if process.exitcode == _UNGUARDED:
                         raise InputError(
@@ -276,34 +234,22 @@ def simulate_replicas(
                             "them below `if __name__ == '__main__':`."
                         )
                     if process.exitcode != 0:
-                        _collect(board.errors, reasons, k)
-                        failures[k] = reasons.get(k, f"exit code {process.exitcode}")
+                        said[k].setdefault("failed", f"exit code {process.exitcode}")
                         if announce is not None and (waiting or running):
-                            announce(_error(failures, jobs))
+                            announce(cast(SimulationError, error()))
+                n_done = sum(words.get("done", 0) for words in said)
+                if n_done == 0:
+                    report_preparing(progress, sum(words.get("equilibrated", 0.0) for words in said) / len(jobs))
+                elif progress is not None:
+                    progress(n_done, config.n_frames * len(outs))
         finally:
-            for process in running.values():
+            for process, _ in running.values():
                 process.terminate()
-            for process in running.values():
+            for process, _ in running.values():
                 process.join()
-    if failures:
-        raise _error(failures, jobs)
+    if failure := error():
+        raise failure
     return list(outs)
-
-
-def _error(failures: dict[int, str], jobs: Sequence[range]) -> SimulationError:
-    k = min(failures)
-    failed, of_all = sum(len(jobs[i]) for i in failures), sum(map(len, jobs))
-    return SimulationError(f"{failed} of {of_all} replicas failed; replica {jobs[k][0]}: {failures[k]}")
-
-
-def _collect(errors: Any, reasons: dict[int, str], wanted: int) -> None:
-    """Read what replicas said when they failed, until `wanted` is among them; a killed one says nothing."""
-    try:
-        while wanted not in reasons:
-            k, reason = errors.get(timeout=1)
-            reasons[k] = reason
-    except queue.Empty:
-        pass
 
 
 def _run(
@@ -318,23 +264,19 @@ def _run(
         simulate(scenes[0], config, outs[0], progress=progress, **how)
 
 
-def _replicas(
-    scenes: Sequence[Scene], config: MDConfig, outs: Sequence[Path], how: dict[str, Any], board: _Board, k: int
-) -> None:
-    """Run the k-th job in a process of its own."""
+def _replicas(scenes: Sequence[Scene], config: MDConfig, outs: Sequence[Path], how: dict[str, Any], pipe: Any) -> None:
+    """Run a job in a process of its own, which says into `pipe` how far it is, or why it failed."""
     end_with_parent()
     os.environ["OPENMM_CPU_THREADS"] = "1"
 
     def report(done: int, total: int, note: str | None = None) -> None:
-        if note is None:
-            board.done[k] = done
-        else:
-            board.equilibrated[k] = done / total
+        with suppress(OSError):  # the parent is gone, and this process ends, too
+            pipe.send(("done", done) if note is None else ("equilibrated", done / total))
 
     try:
         _run(scenes, config, outs, how, report)
     except SurromdError as error:
-        board.errors.put((k, str(error)))
+        pipe.send(("failed", str(error)))
         raise SystemExit(1) from None
     except KeyboardInterrupt:
         raise SystemExit(130) from None

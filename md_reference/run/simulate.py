@@ -11,11 +11,12 @@ from pathlib import Path
 from typing import Annotated, Any, Protocol
 
 import numpy as np
+import numpy.typing as npt
 
 from md_reference.forces.forcefield import build_system
 from md_reference.run.config import MDConfig, check_run, check_same_run, settings_of
-from md_reference.run.engine import Engine, State, integrator_name, refuse_damaged
-from md_reference.run.machine import PlatformChoice, measured_platform
+from md_reference.run.engine import Engine, State, refuse_damaged
+from md_reference.run.machine import PlatformChoice, platform_for
 from md_reference.run.run_summary import summarise
 from systems.errors import InputError, SimulationError
 from systems.files.schema import built
@@ -53,8 +54,8 @@ def report_preparing(progress: ProgressFn | None, share: float) -> None:
 
 # Python sees Ctrl-C only between calls of OpenMM: about so long may pass until it does.
 _SIGNAL_S = 0.25
-# Held in memory, then flushed together with a checkpoint: what a `kill -9` costs at most, or one frame if that is more.
-_BLOCK_S = 0.5
+# Frames that are written at once, at most.
+_MOST_FRAMES = 1000
 
 
 def simulate(
@@ -65,21 +66,17 @@ def simulate(
     resume: bool = False,
     overwrite: bool = False,
     progress: ProgressFn | None = None,
-    checkpoint_every_s: float = 20.0,
     choice: PlatformChoice | None = None,
 ) -> Path:
     """Run reference MD and stream it to `out` (.h5, .dcd, .xtc): frames at save_every_ps, 2 save_every_ps ... time_ps.
 
-    A checkpoint stands behind every block of frames and, in frames that take longer, every `checkpoint_every_s` of wall
-    time; frames and checkpoint are on the medium before the run goes on. So a `kill -9`, a full disk or a power failure
-    loses at most one save interval, half a second of work, or fifty times what it takes to write, whichever is the
-    longest; `resume=True` goes on from there with the same random stream, on the same platform, if the frames are still
-    those of this run. The equilibration is kept in the same way. Ctrl-C and SIGTERM stop at once with a checkpoint,
-    inside a frame if need be: KeyboardInterrupt. No other process can write `out` meanwhile.
+    A checkpoint stands behind every block of frames: a `kill -9`, a full disk or a power failure loses at most one save
+    interval, half a second of work, or fifty times what it takes to write, whichever is the longest. `resume=True` goes
+    on from there with the same random stream, on the same platform. Ctrl-C and SIGTERM stop at once, with a checkpoint
+    at the last frame: KeyboardInterrupt. No other process can write `out` meanwhile.
 
-    With `platform='auto'` the platform is measured (`platforms.measured_platform`, one thread), unless `choice` says
-    what has been. Raises SimulationError when coordinates stop being finite or the system blows up
-    (`Engine.state`): the frames before stay in the file, which then says `completed: false`.
+    `choice`: the platform where it has been chosen before. Raises SimulationError when coordinates stop being finite or
+    the system blows up: the frames before stay in the file, which then says `completed: false`.
     """
     out = Path(out)
     config = check_run(scene, config, out)
@@ -89,35 +86,48 @@ def simulate(
             already_complete(out, config)
             return out
         kept = supported_checkpoint(chk, [out]) if resume and chk.exists() else None
-        run = _Run(scene, config, out, kept, overwrite=overwrite)
-        run.asked_to_stop, run.progress, run.checkpoint_every_s = asked_to_stop, progress, checkpoint_every_s
-        run.prepare(choice)
-        with run.engine_at_start() as engine, run.writer() as writer:
-            run.produce(engine, writer)
+        run = _Run(scene, config, [out], kept, overwrite=overwrite, asked_to_stop=asked_to_stop, progress=progress)
+        run.start(choice)
+        how: dict[str, Any] = {"resumed": run.resumed, "columns": config.columns}
+        record = record_of(scene, config, run.choice)
+        with run.engine, writer_at(out, run.written, record, run.header, **how) as writer:
+            run.produce([writer])
         chk.unlink(missing_ok=True)
     return out
 
 
 @dataclass(frozen=True)
 class Stand:
-    """Where a run stands, as its checkpoint says beside what all of them do; while it equilibrates, so far."""
+    """Where a run stands, as its checkpoint says beside what all of them do."""
 
     config: dict[str, Any] = field(default_factory=dict)
     wall_s: float = 0.0
     platform: str = ""
     threads: Annotated[int, range(1, 1025)] = 1
-    steps_into_frame: Annotated[int, range(2**63)] = 0
-    equilibrated_steps: Annotated[int, range(2**63)] | None = None
 
 
 class StoredRun:
     """Replicas on their way (one, or a batch with one checkpoint): what is done, since when, what their files say.
     Raises InputError for a checkpoint that is not of this run."""
 
+    # Held in memory, then flushed with a checkpoint: what a `kill -9` costs at most, or one frame if that is more.
+    block_s = 0.5
+    n_dof = 0
+    others = ""
+
     def __init__(
-        self, scene: Scene, config: MDConfig, outs: Sequence[Path], kept: Checkpoint | None, *, overwrite: bool
+        self,
+        scene: Scene,
+        config: MDConfig,
+        outs: Sequence[Path],
+        kept: Checkpoint | None,
+        *,
+        overwrite: bool,
+        asked_to_stop: Callable[[], bool],
+        progress: ProgressFn | None,
     ) -> None:
         self.scene, self.config, self.outs = scene, config, outs
+        self.asked_to_stop, self.progress = asked_to_stop, progress
         self.resumed = kept is not None
         self.header, self.blob = kept or (new_header(len(outs), overwrite=overwrite), b"")
         try:
@@ -126,6 +136,9 @@ class StoredRun:
             raise InputError(f"checkpoint {checkpoint_path(outs[0])} cannot be gone on from ({error}).") from error
         if self.resumed:
             check_same_run(self.stand.config, config, outs[0])
+            if self.header.get("steps_into_frame") or self.header.get("equilibrated_steps") is not None:
+                chk = checkpoint_path(outs[0])
+                raise InputError(f"{chk} stands inside a frame, as an earlier version left it; start with `overwrite`.")
         self.began = time.monotonic()
         self.done = int(self.header["files"][0]["n_frames"])
         solute = config.kept_atoms(scene)
@@ -152,35 +165,69 @@ class StoredRun:
         self.header = {key: self.header[key] for key in ("run_id", "overwrite", "files")} | said
         write_checkpoint(checkpoint_path(self.outs[0]), self.header, blob)
 
-    def written_so_far(self, writers: Sequence[TrajectoryWriter], n_new: int) -> None:
-        """Count frames that were appended to each file."""
-        self.done += n_new
-        self.header["files"] = [{"n_frames": self.done, "digest": writer.digest()} for writer in writers]
+    def save(self) -> None:
+        """Write the checkpoint, which stands at the last frame."""
+        raise NotImplementedError
 
-    def refuse_failed(self, failure: str, writers: Sequence[TrajectoryWriter], where: str) -> None:
-        """Raise SimulationError, and say in the files why they hold no more frames, where a run has failed."""
-        if not failure:
-            return
-        for writer in writers:
-            writer.update_record({"completed": False, "failure": failure, "cost": self.cost()})
-        raise SimulationError(
-            f"{self.scene.name}: {failure} after {format_time_ps(self.done * self.config.save_every_ps)}; "
-            f"{self.done} good frames are in {where}"
-        )
+    def frame(self) -> Any:
+        """Return what is kept of the next frame, None when somebody asked to stop. Raises SimulationError."""
+        raise NotImplementedError
 
-    def stop(self, writers: Sequence[TrajectoryWriter]) -> None:
-        """Raise KeyboardInterrupt, the cost so far in the files."""
-        for writer in writers:
-            writer.update_record({"cost": self.cost()})
-        raise KeyboardInterrupt
+    def append(self, writers: Sequence[TrajectoryWriter], frames: Sequence[Any], times_ps: npt.ArrayLike) -> None:
+        """Write frames, which there are."""
+        raise NotImplementedError
 
-    def finish(self, writers: Sequence[TrajectoryWriter], n_dof: int) -> None:
+    def produce(self, writers: Sequence[TrajectoryWriter]) -> None:
+        """Append frames until all are there. Raises SimulationError, StorageError, KeyboardInterrupt."""
+        n_frames, flushed_s, most = self.config.n_frames, 0.0, 1
+        while self.done < n_frames:
+            frames, failure = self._block(min(most, n_frames - self.done), max(self.block_s, FLUSH_SHARE * flushed_s))
+            computed, most = time.monotonic(), min(2 * most, _MOST_FRAMES)
+            if frames:
+                self.append(writers, frames, (self.done + 1 + np.arange(len(frames))) * self.config.save_every_ps)
+                self.done += len(frames)
+                self.header["files"] = [{"n_frames": self.done, "digest": writer.digest()} for writer in writers]
+            if failure:
+                for writer in writers:
+                    writer.update_record({"completed": False, "failure": failure, "cost": self.cost()})
+                after = format_time_ps(self.done * self.config.save_every_ps)
+                raise SimulationError(
+                    f"{self.scene.name}: {failure} after {after}; {self.done} good frames are in "
+                    f"{self.outs[0]}{self.others}. {_advice(self.config)}"
+                )
+            stop = self.asked_to_stop() and self.done < n_frames
+            if self.done < n_frames:
+                self.save()
+            flushed_s = time.monotonic() - computed
+            if self.progress is not None:
+                self.progress(len(writers) * self.done, len(writers) * n_frames)
+            if stop:
+                for writer in writers:
+                    writer.update_record({"cost": self.cost()})
+                raise KeyboardInterrupt
+        self.finish(writers)
+
+    def _block(self, most: int, seconds: float) -> tuple[list[Any], str]:
+        """Return the frames of the next seconds, up to `most`, and why there are no more, if the run has failed."""
+        frames: list[Any] = []
+        until = time.monotonic() + seconds
+        while len(frames) < most and not (frames and time.monotonic() > until):
+            try:
+                frame = self.frame()
+            except SimulationError as error:
+                return frames, str(error)
+            if frame is None:
+                break
+            frames.append(frame)
+        return frames, ""
+
+    def finish(self, writers: Sequence[TrajectoryWriter]) -> None:
         """Say in the files that they are complete, what they cost, and how the run went."""
         config, mass_da = self.config, float(self.scene.masses_da.sum())
         bath: dict[str, Any] = {"ensemble": config.ensemble, "temperature_k": config.temperature_k}
         for writer in writers:
             time_ps, scalars = writer.series()
-            summary = summarise(time_ps, scalars, mass_da=mass_da, n_dof=n_dof, **bath)
+            summary = summarise(time_ps, scalars, mass_da=mass_da, n_dof=self.n_dof, **bath)
             # A resumed run may have become longer than the one that wrote the record.
             length = {"completed": True, "time_ps": config.time_ps}
             writer.update_record({**length, "cost": self.cost(), "summary": summary})
@@ -189,78 +236,58 @@ class StoredRun:
 class _Run(StoredRun):
     """One replica by OpenMM."""
 
-    asked_to_stop: Callable[[], bool] = staticmethod(lambda: False)
-    progress: ProgressFn | None = None
-    checkpoint_every_s = 20.0
+    choice: PlatformChoice
+    engine: Engine
+    # Steps at once, so that a wish to stop is heard soon.
+    piece = 10
 
-    def __init__(self, scene: Scene, config: MDConfig, out: Path, kept: Checkpoint | None, *, overwrite: bool) -> None:
-        super().__init__(scene, config, [out], kept, overwrite=overwrite)
-        self.steps_into_frame, self.saved_at, self.piece = self.stand.steps_into_frame, self.began, 10
-        self.system: Any = None
-
-    def prepare(self, choice: PlatformChoice | None) -> None:
-        """Build the forces and settle the platform."""
+    def start(self, choice: PlatformChoice | None) -> None:
+        """Settle the platform, and go to where the run was left, or to time 0."""
         self.system = build_system(self.scene, self.config.force)
         if self.resumed:
             choice = PlatformChoice(self.stand.platform, self.stand.threads, "as before it was resumed")
-        self.choice = choice or measured_platform(self.scene, self.config, system=lambda: self.system)
+        self.choice = choice or platform_for(self.scene, self.config)
+        if self.resumed:
+            self.engine = self._engine(self.config.ensemble)
+            self.engine.restore(self.blob)
+        else:
+            self.engine = self._equilibrated()
+            # Before there is a file, so that a run killed at any later moment can be resumed like any other.
+            self.blob = self.engine.checkpoint()
+            self.save()
+        self.n_dof = self.engine.n_dof
 
-    def engine(self, ensemble: str) -> Engine:
+    def _engine(self, ensemble: str) -> Engine:
         conditions = replace(self.config, ensemble=ensemble, platform=self.choice.name)
         return Engine(self.scene, conditions, threads=self.choice.threads, system=self.system)
-
-    def engine_at_start(self) -> Engine:
-        """Return the engine where the run was left, or at time 0."""
-        if self.resumed and self.stand.equilibrated_steps is None:
-            engine = self.engine(self.config.ensemble)
-            engine.restore(self.blob)
-        else:
-            engine = self._equilibrated()
-        if not self.done:
-            # Before there is a file, so that a run killed at any later moment can be resumed like any other.
-            self.save(engine)
-        return engine
-
-    def writer(self) -> TrajectoryWriter:
-        """Return the writer of the trajectory, which holds the frames that are done."""
-        record = record_of(self.scene, self.config, self.choice)
-        columns = self.config.columns
-        return writer_at(self.outs[0], self.written, record, self.header, resumed=self.resumed, columns=columns)
 
     def _equilibrated(self) -> Engine:
         """Return the engine at time 0: minimised, and run for `equilibrate_ps` in the bath."""
         config = self.config
-        bath = self.engine("nvt" if config.ensemble == "nve" else config.ensemble)
+        bath = self._engine("nvt" if config.ensemble == "nve" else config.ensemble)
         try:
             self._equilibrate(bath)
             if config.ensemble != "nve":
-                bath.reset_clock()
                 return bath
             state = bath.state(velocities=True)
         except SimulationError as error:
             raise SimulationError(f"{self.scene.name}: {error} before the first frame. {_advice(config)}") from error
         bath.close()
-        engine = self.engine("nve")
+        engine = self._engine("nve")
         engine.take_over(state)
         return engine
 
     def _equilibrate(self, engine: Engine) -> None:
         n_steps = math.ceil(round(self.config.equilibrate_ps / self.config.timestep_ps, 6))
-        done = self.stand.equilibrated_steps or 0
-        report_preparing(self.progress, done / max(n_steps, 1))
-        if self.blob:
-            engine.restore(self.blob)
-        else:
-            engine.minimise()
-            refuse_damaged(self.scene, engine.positions())
-            engine.thermalise()
+        report_preparing(self.progress, 0.0)
+        engine.minimise()
+        refuse_damaged(self.scene, engine.positions())
+        engine.thermalise()
+        done = 0
         while done < n_steps:
             done += self._advance(engine, n_steps - done)
             report_preparing(self.progress, done / n_steps)
-            stop = self.asked_to_stop()
-            if stop or time.monotonic() - self.saved_at > self.checkpoint_every_s:
-                self.save(engine, equilibrated_steps=done)
-            if stop:
+            if self.asked_to_stop():
                 raise KeyboardInterrupt
         engine.state()
 
@@ -273,71 +300,33 @@ class _Run(StoredRun):
         self.piece = max(1, min(2 * self.piece, math.ceil(taken * _SIGNAL_S / seconds), 100_000))
         return taken
 
-    def save(self, engine: Engine, **more: Any) -> None:
-        """Write the checkpoint."""
-        self.keep(engine.checkpoint(), platform=engine.platform_name, threads=engine.threads, **more)
-        self.saved_at = time.monotonic()
+    def save(self) -> None:
+        self.keep(self.blob, platform=self.engine.platform_name, threads=self.engine.threads)
 
-    def produce(self, engine: Engine, writer: TrajectoryWriter) -> None:
-        """Append frames until all are there. Raises SimulationError, StorageError, KeyboardInterrupt."""
-        config, n_frames = self.config, self.config.n_frames
-        block = 1
-        while self.done < n_frames:
-            size = min(block, n_frames - self.done)
-            began = time.monotonic()
-            states, failure = self._frames(engine, size)
-            computed = time.monotonic()
-            self._write(writer, states)
-            self.written_so_far([writer], len(states))
-            self.refuse_failed(failure, [writer], f"{self.outs[0]}. {_advice(config)}")
-            stop = self.asked_to_stop() and self.done < n_frames
-            if self.done < n_frames:
-                self.save(engine, steps_into_frame=self.steps_into_frame)
-            flushed_s = time.monotonic() - computed
-            if self.progress is not None:
-                self.progress(self.done, n_frames)
-            if stop:
-                self.stop([writer])
-            per_frame_s = max((computed - began) / max(len(states), 1), 1e-6)
-            block = min(max(1, round(max(_BLOCK_S, FLUSH_SHARE * flushed_s) / per_frame_s)), 1000, 2 * block)
-        self.finish([writer], engine.n_dof)
+    def frame(self) -> State | None:
+        steps, per_frame = 0, self.config.steps_per_frame
+        while steps < per_frame:
+            if self.asked_to_stop():
+                return None
+            steps += self._advance(self.engine, per_frame - steps)
+        state = self.engine.state(velocities=self.config.save_velocities, forces=self.config.save_forces)
+        self.blob = self.engine.checkpoint()
+        return state
 
-    def _frames(self, engine: Engine, n: int) -> tuple[list[State], str]:
-        """Return up to `n` frames, fewer when somebody asked to stop or the run failed, and why it failed."""
-        states: list[State] = []
-        config, per_frame = self.config, self.config.steps_per_frame
-        while len(states) < n:
-            try:
-                while self.steps_into_frame < per_frame:
-                    if self.asked_to_stop():
-                        return states, ""
-                    self.steps_into_frame += self._advance(engine, per_frame - self.steps_into_frame)
-                    if not states and time.monotonic() - self.saved_at > self.checkpoint_every_s:
-                        self.save(engine, steps_into_frame=self.steps_into_frame)
-                states.append(engine.state(velocities=config.save_velocities, forces=config.save_forces))
-                self.steps_into_frame = 0
-            except SimulationError as error:
-                return states, str(error)
-        return states, ""
-
-    def _write(self, writer: TrajectoryWriter, states: list[State]) -> None:
-        if not states:
-            return
-        config = self.config
-
+    def append(self, writers: Sequence[TrajectoryWriter], frames: Sequence[State], times_ps: npt.ArrayLike) -> None:
         def written(name: str) -> FloatArray:
-            return np.array([getattr(s, name)[self.atoms] for s in states])
+            return np.array([getattr(s, name)[self.atoms] for s in frames])
 
-        scalars = {name: np.array([getattr(s, name) for s in states]) for name in ("potential_kj_mol", "temperature_k")}
-        cells = None if self.scene.cell_nm is None else np.array([s.cell_nm for s in states])
-        if cells is not None and config.ensemble == "npt":
+        scalars = {name: np.array([getattr(s, name) for s in frames]) for name in ("potential_kj_mol", "temperature_k")}
+        cells = None if self.scene.cell_nm is None else np.array([s.cell_nm for s in frames])
+        if cells is not None and self.config.ensemble == "npt":
             scalars["volume_nm3"] = np.linalg.det(cells)
-        writer.append(
+        writers[0].append(
             written("positions_nm").astype(np.float32),
-            (self.done + 1 + np.arange(len(states))) * config.save_every_ps,
+            times_ps,
             scalars=scalars,
-            velocities_nm_ps=written("velocities_nm_ps") if config.save_velocities else None,
-            forces_kj_mol_nm=written("forces_kj_mol_nm") if config.save_forces else None,
+            velocities_nm_ps=written("velocities_nm_ps") if self.config.save_velocities else None,
+            forces_kj_mol_nm=written("forces_kj_mol_nm") if self.config.save_forces else None,
             cell_nm=cells,
         )
 
@@ -348,7 +337,7 @@ def record_of(scene: Scene, config: MDConfig, choice: PlatformChoice) -> dict[st
 
     return {
         "kind": "reference",
-        "integrator": integrator_name(config.ensemble),
+        "integrator": "VelocityVerlet" if config.ensemble == "nve" else "LangevinMiddle",
         "program": {"openmm": openmm.__version__},
         "started": datetime.now(UTC).isoformat(timespec="seconds"),
         "completed": False,

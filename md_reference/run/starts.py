@@ -1,7 +1,7 @@
 """Where replicas begin: each in a state of its own, so that together they do not remember one structure.
 
-The first is the scene itself; the others were hot for a while and have cooled down. Handedness, peptide and double
-bonds are those of the scene. All is a function of scene, forces, number and seed: what resumes begins where it began.
+The first is the scene itself; the others were hot for a while and have cooled down, handedness, peptide and double
+bonds kept. All is a function of scene, forces, number and seed: what resumes begins where it began.
 """
 
 from __future__ import annotations
@@ -50,8 +50,7 @@ def many_starts(scene: Scene, conditions: Conditions, n: int, *, hot_ps: float =
 
     They come from `hot_ps` at 500 K and a fifth of that at the bath's temperature, by SIMD replicas where these run the
     scene, else by OpenMM; at quantum level by GAFF2. In explicit water the solute is turned to the torsions that its
-    dry self then has. Where nothing turns, or nothing can turn it, or hot MD fails, all begin in the scene's own
-    structure, and `how` says so. Raises KeyboardInterrupt.
+    dry self then has. Where nothing turns, or hot MD fails, all begin in the scene's own structure, and `how` says so.
     """
 
     def one(why: str) -> Starts:
@@ -81,12 +80,9 @@ def many_starts(scene: Scene, conditions: Conditions, n: int, *, hot_ps: float =
 def frames_as_starts(
     scene: Scene, conditions: Conditions, frames_nm: Iterable[npt.NDArray[np.floating]], n: int
 ) -> Starts:
-    """Return starts from frames, each `(n_atoms, 3)` nm, that may be drawn while they are taken: the first `n` that are
-    the scene's molecule when they are relaxed near where they are; fewer where fewer are, each then taken several
-    times.
-
-    Raises SimulationError where none is.
-    """
+    """Return starts from frames, each `(n_atoms, 3)` nm: the first `n` that are the scene's molecule when they are
+    relaxed near where they are; fewer where fewer are, each then taken several times. Raises SimulationError where none
+    is."""
     found: list[FloatArray] = []
     tried = 0
     geometry = geometry_from_scene(scene)

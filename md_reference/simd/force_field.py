@@ -136,9 +136,8 @@ class SimdReplicas:
 
     `system`: an `openmm.System` of harmonic bonds and angles, periodic torsions and a NonbondedForce; without a cell
     NoCutoff and, if any, GBSAOBCForce; with one PME or a reaction field, and rigid three-site waters. Anything else
-    raises SimdUnavailableError. Friction 0 is NVE (leapfrog). Positions and velocities are
-    `(n_replicas, n_atoms, 3)` in nm and nm/ps, in the System's order. `biased`: torsions, each four atoms, that
-    `set_bias` may hold in each replica at another angle.
+    raises SimdUnavailableError. Friction 0 is NVE (leapfrog). Positions and velocities are `(n_replicas, n_atoms, 3)`
+    in nm and nm/ps, in the System's order. `biased`: torsions, each four atoms, for `set_bias`.
     """
 
     def __init__(
@@ -260,10 +259,8 @@ class SimdReplicas:
 
     def check(self, system: Any, positions_nm: npt.ArrayLike) -> None:
         """Compare energies and forces with OpenMM's at slightly disturbed copies of one structure `(n_atoms, 3)` nm.
-
-        Raises SimulationError where they differ by more than single precision explains; in water, by more than
-        reciprocal grids of other points do.
-        """
+        Raises SimulationError where they differ by more than single precision, or in water reciprocal grids of other
+        points, explain."""
         import openmm
 
         given = np.asarray(positions_nm, dtype=np.float64)

@@ -21,9 +21,9 @@ if TYPE_CHECKING:
 def campaign(file: PathLike, out: PathLike | None = None, *, options: CampaignOptions) -> dict[str, Any]:
     """Simulate many scenes, temperatures and replicas as a TOML file says, on Dask, and return `info` of the folder.
 
-    Runs on `workers` processes of this machine (one per core), on a Dask `scheduler` (tcp://host:port), or on the jobs
-    of the file's [cluster]. What is finished is not done again; what fails stands in the result's `failed`. `dry_run`:
-    return what would be run, and start nothing. `out` replaces the folder that the file names.
+    Runs on `workers` processes of this machine (one per core), or on a Dask `scheduler` (tcp://host:port). What is
+    finished is not done again; what fails stands in the result's `failed`. `dry_run`: return what would be run, and
+    start nothing. `out` replaces the folder that the file names.
     Raises InputError for a file that cannot be meant, and for the folder of another campaign.
     """
     from md_reference.campaign.campaign_file import read_campaign
@@ -41,10 +41,9 @@ def campaign(file: PathLike, out: PathLike | None = None, *, options: CampaignOp
         if not options.quiet:
             sys.stderr.write(f"{name}: {reason}\n")
 
-    where: dict[str, Any] = {"workers": options.workers, "scheduler": options.scheduler, "cluster": asked.cluster}
     try:
         with (
-            open_client(**where, retries=asked.retries, folder=asked.folder) as client,
+            open_client(workers=options.workers, scheduler=options.scheduler, retries=asked.retries) as client,
             progress_bar(f"campaign {asked.name}", quiet=options.quiet) as advance,
         ):
 

@@ -30,7 +30,7 @@ def plan(scene: str | Path | Scene, options: PlanOptions) -> dict[str, Any]:
     molecule = prepare_scene(scene, options, quiet=False)
     molecule, config, protocol = resolve_run(molecule, options, {"time_ps": options.time_ps or 0.0}, quiet=True)
     found = asdict(make_plan(molecule, config, replicas=options.replicas))
-    return found | ({"protocol": protocol} if protocol else {})
+    return {"line": found.pop("line"), **found.pop("rows"), **found} | ({"protocol": protocol} if protocol else {})
 
 
 @options_as_keywords(ReferenceOptions)

@@ -1,7 +1,4 @@
-"""Bond orders and formal charges from elements and connectivity, hydrogens included.
-
-The cheapest Lewis structure of a connectivity is found by integer programming.
-"""
+"""Bond orders and formal charges from elements and connectivity, hydrogens included: the cheapest Lewis structure."""
 
 from __future__ import annotations
 
@@ -10,6 +7,8 @@ from collections.abc import Collection, Mapping, Sequence
 import networkx as nx
 import numpy as np
 import numpy.typing as npt
+
+from systems.chemistry.graph import ring_sizes
 
 # (valence, charge, penalty) by element and number of neighbours. As in antechamber's bond type perception (Wang, Wang,
 # Kollman and Case, J. Mol. Graph. Model. 2006, 25, 247) a penalty says how unusual a state is; here every state is
@@ -69,16 +68,16 @@ def lewis_structure(
 ) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.int64]] | None:
     """Return bond orders `(n_bonds,)` and formal charges `(n_atoms,)` of the structure of least penalty, or None.
 
-    Every hydrogen must be present; no atom keeps an unpaired electron. `stated` holds orders that a file gives pairs
-    i < j, which decide between structures that are otherwise alike; `total_charge` is the only one allowed.
-    `carbon_ions` admits carbocations and carbanions.
+    Every hydrogen must be present; no atom keeps an unpaired electron. `stated`: orders that a file gives pairs i < j,
+    which decide between structures that are otherwise alike; `total_charge`: the only one allowed; `carbon_ions` admits
+    carbocations and carbanions.
     """
     pairs = [(min(i, j), max(i, j)) for i, j in bonds.tolist()]
     graph = nx.Graph(pairs)
     graph.add_nodes_from(range(len(elements)))
     neighbours = [sorted(graph[i]) for i in range(len(elements))]
-    rings = _oxonium_rings(elements, graph)
-    states = [_states(elements, graph, neighbours, i, rings, carbon_ions) for i in range(len(elements))]
+    rings, oxonium = ring_sizes(graph), _oxonium(elements, graph)
+    states = [_states(elements, neighbours, i, rings, oxonium, carbon_ions) for i in range(len(elements))]
     if not all(states):
         return None
     orders = np.ones(len(pairs))
@@ -104,21 +103,22 @@ def lewis_structure(
 
 def _states(
     elements: Sequence[str],
-    graph: nx.Graph,
     neighbours: Sequence[Sequence[int]],
     i: int,
-    rings: set[int],
+    rings: Mapping[tuple[int, int], int],
+    oxonium: set[int],
     carbon_ions: bool,
 ) -> tuple[_State, ...]:
     symbol, near = elements[i], neighbours[i]
     states = _ANY.get(symbol, {}).get(len(near), ())
     around = [(elements[j], len(neighbours[j])) for j in near]
-    if symbol == "C" and len(near) == 2 and _in_small_ring(graph, i):
+    sizes = {rings[bond] for j in near if (bond := (min(i, j), max(i, j))) in rings}
+    if symbol == "C" and len(near) == 2 and min(sizes, default=8) < 8:
         return ()  # as bent as no triple bond or cumulene is: a ring that misses a hydrogen
     if symbol == "C" and len(near) == 1 and around[0] in (("N", 1), ("N", 2), ("O", 1)):
         states = (_CYANIDE,)
     elif symbol == "C" and carbon_ions:
-        anion = _CYCLOPENTADIENIDE if len(near) == 3 and _in_five_ring(graph, i) else _CARBANION
+        anion = _CYCLOPENTADIENIDE if len(near) == 3 and 5 in sizes else _CARBANION
         states = (*states, anion, *((_CARBENIUM,) if len(near) == 3 else ()))
     elif symbol == "N" and len(near) == 2 and any(e != "H" and degree == 1 for e, degree in around):
         states = _MIDDLE
@@ -126,7 +126,7 @@ def _states(
         states = (*states, _AZIDE_END)
     elif symbol == "O" and around == [("O", 1)] * 2:
         states = (_OZONE,)
-    elif symbol == "O" and (i in rings or around == [("C", 1)]):
+    elif symbol == "O" and (i in oxonium or around == [("C", 1)]):
         states = (*states, _OXONIUM)
     return states
 
@@ -138,33 +138,13 @@ def _is_ylide(elements: Sequence[str], neighbours: Sequence[Sequence[int]], i: i
     )
 
 
-def _in_small_ring(graph: nx.Graph, i: int) -> bool:
-    """Whether an atom with two neighbours is in a ring of fewer than eight."""
-    a, b = graph[i]
-    near = nx.single_source_shortest_path_length(nx.restricted_view(graph, [i], []), a, cutoff=5)
-    return b in near
-
-
-def _in_five_ring(graph: nx.Graph, i: int) -> bool:
-    rest = nx.restricted_view(graph, [i], [])
-    reached = {j: nx.single_source_shortest_path_length(rest, j, cutoff=3) for j in graph[i]}
-    return any(reached[j].get(k) == 3 for j in graph[i] for k in graph[i])
-
-
-def _oxonium_rings(elements: Sequence[str], graph: nx.Graph) -> set[int]:
+def _oxonium(elements: Sequence[str], graph: nx.Graph) -> set[int]:
     """Oxygens of six-rings without a saturated member (pyrylium, flavylium), which may take a third bond."""
-    found: set[int] = set()
     flat = graph.subgraph(
         i for i in graph if (elements[i] in ("C", "N") and graph.degree(i) in (2, 3)) or
         (elements[i] == "O" and graph.degree(i) == 2)
     )  # fmt: skip
-    for i in flat:
-        if elements[i] == "O" and flat.degree(i) == 2:
-            a, b = flat[i]
-            rest = flat.subgraph(j for j in flat if j != i)
-            if nx.has_path(rest, a, b) and nx.shortest_path_length(rest, a, b) == 4:
-                found.add(i)
-    return found
+    return {i for bond, size in ring_sizes(flat).items() if size == 6 for i in bond if elements[i] == "O"}
 
 
 def _solve(
@@ -267,11 +247,10 @@ def perceive(
     """Return bond orders `(n_bonds,)` and formal charges `(n_atoms,)` of one Kekulé structure.
 
     Every hydrogen must be present. Open valences are paired by a maximum matching (C=O before C=N before C=C); what
-    stays open is an anion on O and S, a cation on a nitrogen beside an open carbon (guanidinium, imidazolium). A
-    molecule that this leaves with an atom in no usual state is given the Lewis structure of least penalty. With
-    `positions_nm` `(n_atoms, 3)`, carbons that such a structure, a charge beside them or a C=C makes unsaturated must
-    be flat or straight: one that is not misses a hydrogen, unless it is `trusted` to have all. Raises ValenceError
-    naming the atoms that fit nothing (missing hydrogens, wrong bonds, unknown elements).
+    stays open is an anion on O and S, a cation on a nitrogen beside an open carbon. A molecule that this leaves with an
+    atom in no usual state is given the Lewis structure of least penalty. With `positions_nm` `(n_atoms, 3)`, carbons
+    that are unsaturated in such a structure, beside a charge or in C=C must be flat or straight, unless they are
+    `trusted` to have all hydrogens. Raises ValenceError naming the atoms that fit nothing.
     """
     neighbours: list[list[int]] = [[] for _ in elements]
     for i, j in bonds.tolist():
@@ -365,10 +344,8 @@ def _refuse_bent(
 
 class _Kekule:
     """One Kekulé structure by matching: `orders (n_bonds,)`, `charges (n_atoms,)`, `bad` atoms that fit nothing.
-
-    While it is made, `order` holds that of each bond (i, j), i < j, and `_open` what valence each atom has left, below
-    zero where it has too many bonds.
-    """
+    `order` holds that of each bond (i, j), i < j, and `_open` what valence each atom has left, negative with too many
+    bonds."""
 
     def __init__(
         self,

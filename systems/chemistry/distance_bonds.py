@@ -21,20 +21,12 @@ from systems.scene import PARTICLE, FloatArray, IntArray, Scene
 _TOLERANCE_NM = 0.04
 # A bond longer than so many sums of covalent radii is none.
 _BOND_STRETCH = 1.3
-# More than any bond is longer than the sum of radii.
-_SLACK_NM = 0.1
 
 
 def with_bonds_by_distance(scene: Scene, cell_nm: npt.ArrayLike | None = None) -> Scene:
-    """Return the scene with bonds, by covalent radii, for residues that hold an atom without any; else as it is.
-
-    Two atoms are bonded when they, or images of theirs in the cell `(3, 3)` nm (rows a, b, c), are nearer than the sum
-    of their radii and 0.04 nm. Ions, rare gases and virtual sites stay alone. Where residues stand in pieces, because a
-    file's atoms are shuffled, every atom is looked at, and bonds that other programs have made of the pieces are
-    dropped where they are impossibly long.
-    """
-    if scene.positions_nm.any() and _are_in_pieces(scene):
-        return _all_by_distance(scene)
+    """Return the scene with bonds for residues that hold an atom without any, else as it is: two atoms are bonded when
+    they, or images of theirs in the cell `(3, 3)` nm (rows a, b, c), are nearer than the sum of their covalent radii
+    and 0.04 nm. Ions, rare gases and virtual sites stay alone."""
     virtual = np.array([e == PARTICLE for e in scene.elements])
     bonded = virtual.copy()
     bonded[scene.bonds.ravel()] = True
@@ -45,50 +37,21 @@ def with_bonds_by_distance(scene: Scene, cell_nm: npt.ArrayLike | None = None) -
         return scene
     atoms = np.flatnonzero(np.isin(residue, open_residues) & ~virtual)
     found = bonds_by_distance([scene.elements[i] for i in atoms], scene.positions_nm[atoms], cell_nm)
-    return _with_more(scene, atoms[found])
-
-
-def _are_in_pieces(scene: Scene) -> bool:
-    """Whether a residue comes back after another one with other atoms; with the same ones it is a copy."""
-    names: dict[tuple[str, str, str], list[set[str]]] = {}
-    pieces: list[set[str]] = [set() for _ in scene.residue_names]
-    for name, r in zip(scene.atom_names, scene.residue_of_atom.tolist(), strict=True):
-        pieces[r].add(name)
-    for key, piece in zip(zip(scene.chain_of_residue, scene.residue_ids, scene.residue_names), pieces, strict=True):
-        names.setdefault(key, []).append(piece)
-    return any(len(own) > 1 and sum(map(len, own)) == len(set().union(*own)) for own in names.values())
-
-
-def _all_by_distance(scene: Scene) -> Scene:
-    i, j = scene.bonds.T
-    length = np.linalg.norm(scene.positions_nm[i] - scene.positions_nm[j], axis=1)
-    radii = np.array([0.0 if e == PARTICLE else covalent_radius_nm(e) for e in scene.elements])
-    good = length < radii[i] + radii[j] + _SLACK_NM
-    # Orders and charges that were perceived in wrong bonds are none.
-    nothing = np.zeros(int(good.sum())), np.zeros_like(scene.formal_charges)
-    kept = replace(scene, bonds=scene.bonds[good], bond_orders=nothing[0], formal_charges=nothing[1])
-    atoms = np.flatnonzero([not is_metal(e) and e != PARTICLE for e in scene.elements])
-    return _with_more(kept, atoms[bonds_by_distance([scene.elements[k] for k in atoms], scene.positions_nm[atoms])])
-
-
-def _with_more(scene: Scene, found: IntArray) -> Scene:
-    known = {tuple(b) for b in scene.bonds.tolist()}
-    orders = dict(zip(map(tuple, scene.bonds.tolist()), scene.bond_orders.tolist(), strict=True))
-    rows = sorted(known | {(i, j) for i, j in found.tolist()})
+    order_of = dict(zip(map(tuple, scene.bonds.tolist()), scene.bond_orders.tolist(), strict=True))
+    order_of = dict.fromkeys(map(tuple, atoms[found].tolist()), 0.0) | order_of
+    rows = sorted(order_of)
     return replace(
         scene,
         bonds=np.array(rows, dtype=np.int64).reshape(-1, 2),
-        bond_orders=np.array([orders.get(row, 0.0) for row in rows], dtype=np.float64),
+        bond_orders=np.array([order_of[row] for row in rows], dtype=np.float64),
     )
 
 
 def bonds_by_distance(
     elements: Sequence[str], positions_nm: npt.ArrayLike, cell_nm: npt.ArrayLike | None = None
 ) -> IntArray:
-    """Return the pairs i < j nearer than the sum of their covalent radii and 0.04 nm; hydrogen bonds to its nearest.
-
-    With a cell `(3, 3)` nm that is wide enough to tell images apart the nearest ones count.
-    """
+    """Return the pairs i < j nearer than the sum of their covalent radii and 0.04 nm, by nearest images where a cell
+    `(3, 3)` nm is wide enough to tell them apart; hydrogen bonds to its nearest."""
     x = np.asarray(positions_nm, dtype=np.float64)
     radii = np.array([covalent_radius_nm(e) for e in elements])
     reach = 2.0 * float(radii.max(initial=0.0)) + _TOLERANCE_NM
@@ -132,11 +95,9 @@ def refuse_long_bonds(
 
 
 def changed_bond(scene: Scene, positions_nm: npt.ArrayLike, *, stretch: float = _BOND_STRETCH) -> str:
-    """Return what of the scene's bonds does not hold at `positions_nm` (n_atoms, 3), in words; empty where all hold.
-
-    A bond is lost where it is longer than `stretch` sums of covalent radii; a hydrogen has moved where it is nearest,
-    in units of that sum, to an atom it is not bonded to.
-    """
+    """Return what of the scene's bonds does not hold at `positions_nm` (n_atoms, 3), in words; empty where all hold: a
+    bond longer than `stretch` sums of covalent radii, or a hydrogen nearest, in units of that sum, to an atom it is not
+    bonded to."""
     if not len(scene.bonds):
         return ""
     x = np.asarray(positions_nm, dtype=np.float64)
@@ -219,10 +180,8 @@ def cell_of(numbers: Sequence[float]) -> FloatArray | None:
 
 def images_of_whole(positions_nm: FloatArray, cell_nm: FloatArray, pairs: IntArray) -> IntArray:
     """Return how many of each cell vector to add to each atom, `(n_atoms, 3)`, so that all `pairs` `(n, 2)` are at
-    their nearest images; the largest uncut part of each molecule stays where it is.
-
-    A molecule that is bonded to an image of itself has no such place, and is left as it is.
-    """
+    their nearest images; the largest uncut part of each molecule stays where it is. A molecule that is bonded to an
+    image of itself is left as it is."""
     n = len(positions_nm)
     images = np.zeros((n, 3), dtype=np.int64)
     steps = -np.rint((positions_nm[pairs[:, 1]] - positions_nm[pairs[:, 0]]) @ np.linalg.inv(cell_nm)).astype(np.int64)
@@ -250,10 +209,8 @@ def bonded_images(
     elements: Sequence[str], positions_nm: FloatArray, cell_nm: FloatArray
 ) -> tuple[IntArray, FloatArray]:
     """Return the pairs i < j `(n, 2)` any images of which are within a bond's length, and the distances `(n,)` nm.
-
     Metals are bonded to nothing. In a cell too small for its atoms, which is another structure's, there are none.
-    Raises PreparationError where most atoms stand in each other.
-    """
+    Raises PreparationError where most atoms stand in each other."""
     if len(elements) > _DENSEST_PER_NM3 * abs(float(np.linalg.det(cell_nm))):
         return np.empty((0, 2), dtype=np.int64), np.empty(0)
     pairs, length = _near_images(positions_nm, cell_nm, _LONGEST_BOND_NM)

@@ -1,7 +1,7 @@
 """Geometry of frames: distances, angles, volumes, torsions and superposition, vectorised over frames.
 
-Columns of coordinates are `(3, n_atoms, n_frames)`, frames last in memory: picking an atom then copies one contiguous
-row of all frames, which is several times faster than picking it from each frame in turn.
+Columns of coordinates are `(3, n_atoms, n_frames)`: picking an atom then copies one contiguous row of all frames,
+several times faster than picking it from each frame in turn.
 """
 
 from __future__ import annotations
@@ -24,11 +24,10 @@ _DEGENERATE = 1e-5
 
 
 def torsion(positions_nm: npt.ArrayLike, quads: npt.ArrayLike) -> FloatArray:
-    """Return torsion angles `(n_frames, k)` in [-pi, pi], positive by the IUPAC convention.
+    """Return torsion angles `(n_frames, k)` in [-pi, pi], positive by the IUPAC convention (1970, rule 1.2).
 
     `positions_nm (n_frames, n_atoms, 3)` or one frame `(n_atoms, 3)` (then the result is `(k,)`), `quads (k, 4)`.
-    Computed in the dtype given, float32 or float64. Source: IUPAC-IUB 1970, rule 1.2; the atan2 form of Blondel and
-    Karplus, J. Comput. Chem. 17, 1132 (1996). Raises InputError for arrays of another shape.
+    Computed in the dtype given, float32 or float64. Raises InputError for arrays of another shape.
     """
     x, single = _frames(positions_nm)
     idx = np.asarray(quads, dtype=np.int64).reshape(-1, 4)
@@ -61,10 +60,8 @@ def near_pairs(points: npt.ArrayLike, reach: float, what: str = "") -> npt.NDArr
 
 
 def signed_volumes(positions_nm: npt.ArrayLike, quads: npt.ArrayLike) -> FloatArray:
-    """Return the signed volumes `(n_frames, k)` nm^3 of (b-a) x (c-a) . (d-a) for quadruples (a, b, c, d) `(k, 4)`.
-
-    One frame `(n_atoms, 3)` gives `(k,)`. For a stereocentre `a` with neighbours b, c, d the sign is its handedness.
-    """
+    """Return the signed volumes `(n_frames, k)` nm^3 of (b-a) x (c-a) . (d-a) for quadruples (a, b, c, d) `(k, 4)`; one
+    frame `(n_atoms, 3)` gives `(k,)`. For a stereocentre `a` with neighbours b, c, d the sign is its handedness."""
     x, single = _frames(positions_nm)
     idx = np.asarray(quads, dtype=np.int64).reshape(-1, 4)
     origin = x[:, idx[:, 0]]
@@ -104,11 +101,10 @@ def superposition(
     """Return the rotations `(n, 3, 3)` and translations `(n, 3)` nm that lay each frame over the template.
 
     A frame x moves to `x @ R.T + t`. `positions_nm (n, n_atoms, 3)`, `template_nm (n_atoms, 3)`; `idx` selects the
-    atoms that are fitted (all by default), `weights` weighs those (equal by default). Rotations are proper: a mirror
-    image stays one. Where the best rotation is not unique (one atom, collinear atoms) one of the best is returned.
-    Source: quaternion form of Horn (1987) with the characteristic polynomial solved by Newton's method as in Theobald,
-    Acta Cryst. A61, 478 (2005); near-degenerate frames are solved by full diagonalisation. Raises InputError for
-    shapes that do not fit or weights that are negative or all zero.
+    atoms that are fitted, `weights` weighs those. Rotations are proper: a mirror image stays one. Where the best
+    rotation is not unique one of the best is returned. Source: quaternion form of Horn (1987) with the characteristic
+    polynomial solved by Newton's method as in Theobald, Acta Cryst. A61, 478 (2005); near-degenerate frames by
+    diagonalisation. Raises InputError for shapes that do not fit or weights that are negative or all zero.
     """
     x, _ = _frames(positions_nm)
     y = np.asarray(template_nm, dtype=np.float64)
@@ -141,10 +137,8 @@ def superpose(
     idx: npt.ArrayLike | None = None,
     weights: npt.ArrayLike | None = None,
 ) -> FloatArray:
-    """Return the frames laid over the template, same shape and dtype as given; see `superposition`.
-
-    All atoms move; `idx` and `weights` say which of them are fitted. One frame `(n_atoms, 3)` gives one frame.
-    """
+    """Return the frames laid over the template, same shape and dtype as given; `idx` and `weights` say which atoms are
+    fitted (`superposition`). One frame `(n_atoms, 3)` gives one frame."""
     x, single = _frames(positions_nm)
     rotation, translation = superposition(x, template_nm, idx=idx, weights=weights)
     moved = np.matmul(x, rotation.transpose(0, 2, 1).astype(x.dtype))
@@ -236,10 +230,8 @@ _BLOCK_VALUES = 262_144
 
 
 def column_blocks(positions_nm: FloatArray, widest: int) -> Iterator[tuple[int, FloatArray]]:
-    """Yield `(first frame, coordinates (3, n_atoms, n))` of frames `(n_frames, n_atoms, 3)` nm, block by block.
-
-    `widest` is the number of rows of the largest intermediate array; blocks are cut so that it stays in the cache.
-    """
+    """Yield `(first frame, coordinates (3, n_atoms, n))` of frames `(n_frames, n_atoms, 3)` nm, in blocks so that the
+    largest intermediate array, of `widest` rows, stays in the cache."""
     size = max(_BLOCK_VALUES // (3 * max(widest, positions_nm.shape[1], 1)), 16)
     kind = np.float64 if positions_nm.dtype == np.float64 else np.float32
     for start in range(0, len(positions_nm), size):

@@ -1,17 +1,18 @@
 """The bonded graph of a scene and what follows from it: classes of equivalent atoms, key, stereocentres, torsions,
 exclusions, and the matching of one scene's atoms to another's.
 
-Atoms are equivalent by connectivity and stereo. Colour refinement (Weisfeiler and Lehman, 1968) on elements and ring
-sizes; stereocentres are atoms whose neighbours all differ, their handedness enters the colours, and the refinement goes
-on until nothing new appears. Known limits, not seen: axial chirality (allenes, hindered biaryls) and centres that only
-a fused ring system tells apart. RDKit's canonical ranks are not used: they tell apart equivalent atoms of rings (8
-classes for 1,4-dimethylcyclohexane, which has 6), they are no hash of a molecule, and training runs without RDKit.
+Equivalence is by colour refinement (Weisfeiler and Lehman, 1968) on elements and ring sizes; stereocentres are atoms
+whose neighbours all differ, their handedness enters the colours, and the refinement goes on until nothing new appears.
+Axial chirality (allenes, hindered biaryls) and centres that only a fused ring system tells apart are not seen. RDKit's
+canonical ranks tell apart equivalent atoms of rings (8 classes for 1,4-dimethylcyclohexane, which has 6), and training
+runs without RDKit.
 """
 
 from __future__ import annotations
 
 import hashlib
 import json
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import permutations
@@ -33,13 +34,11 @@ _CLASH_NM = 0.14
 class AtomClasses:
     """Canonical colours `(n_atoms,)`, equal for equivalent atoms, and the stereocentres they reveal.
 
-    `centres`: rows (centre, a, b, c), neighbours by falling colour, hydrogen last, the fourth left out; `signs` their
-    handedness at the scene's positions: the sign of (a-centre) x (b-centre) . (c-centre).
+    `centres`: rows (centre, a, b, c), neighbours by falling colour, hydrogen last, the fourth left out.
     """
 
     colours: tuple[int, ...]
     centres: tuple[tuple[int, int, int, int], ...]
-    signs: tuple[int, ...]
 
     @property
     def fingerprint(self) -> tuple[int, ...]:
@@ -65,26 +64,24 @@ def classify(scene: Scene, *, stereo: bool = True, mirrored: bool = False) -> At
     Bond orders and atomic charges are left out: programs differ in them for one and the same molecule.
     """
     graph = bonded_graph(scene)
-    rings = _ring_sizes(graph)
+    rings = ring_sizes(graph)
     neighbours = scene.neighbours()
     labels = {(i, j): rings.get((min(i, j), max(i, j)), 0) for i in range(scene.n_atoms) for j in neighbours[i]}
     colours = _refine([_hash(e, len(n)) for e, n in zip(scene.elements, neighbours, strict=True)], neighbours, labels)
     if not stereo:
-        return AtomClasses(tuple(colours), (), ())
+        return AtomClasses(tuple(colours), ())
     flip = -1 if mirrored else 1
     cycles = _lone_cycles(rings)
     double = {pair for pair in _double_bonds(scene) if pair not in rings}
     x = scene.positions_nm
     centres: dict[int, tuple[int, int, int, int]] = {}
-    signs: dict[int, int] = {}
     done: set[tuple[int, int]] = set()
     while True:
         marks: dict[int, list[object]] = {}
         fresh = _fresh_centres(scene.elements, neighbours, colours, set(centres))
         for row in fresh:
             centres[row[0]] = row
-            signs[row[0]] = flip * _sign(x, row)
-            marks[row[0]] = [signs[row[0]]]
+            marks[row[0]] = [flip * _sign(x, row)]
         resolved = len(done)
         for i, j in double - done:
             mark = _cis_trans(x, neighbours, colours, i, j)
@@ -102,8 +99,7 @@ def classify(scene: Scene, *, stereo: bool = True, mirrored: bool = False) -> At
         colours = _refine(marked, neighbours, labels)
         if not fresh and len(done) == resolved and len(set(colours)) == n_classes:
             break
-    order = sorted(centres)
-    return AtomClasses(tuple(colours), tuple(centres[i] for i in order), tuple(signs[i] for i in order))
+    return AtomClasses(tuple(colours), tuple(centres[i] for i in sorted(centres)))
 
 
 def _hash(*parts: object) -> int:
@@ -161,19 +157,14 @@ def _cis_trans(positions_nm: FloatArray, neighbours: list[list[int]], colours: l
     return "cis" if abs(angle) < np.pi / 2 else "trans"
 
 
-def _ring_sizes(graph: nx.Graph) -> dict[tuple[int, int], int]:
-    """Size of the smallest ring through each ring bond (i < j); larger ones than `_LARGEST_RING` count as that + 1."""
+def ring_sizes(graph: nx.Graph) -> dict[tuple[int, int], int]:
+    """Return the size of the smallest ring through each ring bond (i < j); 13 for all larger ones."""
     acyclic = {(min(e), max(e)) for e in nx.bridges(graph)}
     sizes = {}
     for i, j in ((min(e), max(e)) for e in graph.edges):
-        if (i, j) in acyclic:
-            continue
-        front, seen, size = {i}, {i}, 1
-        while front and j not in seen and size <= _LARGEST_RING:
-            front = {k for f in front for k in graph[f] if k not in seen and {f, k} != {i, j}}
-            seen |= front
-            size += 1
-        sizes[i, j] = size
+        if (i, j) not in acyclic:
+            others = nx.restricted_view(graph, [], [(i, j)])
+            sizes[i, j] = min(nx.shortest_path_length(others, i, j) + 1, _LARGEST_RING + 1)
     return sizes
 
 
@@ -243,11 +234,8 @@ def atom_classes(scene: Scene) -> IntArray:
 
 @once_per_scene
 def stereocentres(scene: Scene) -> IntArray:
-    """Return the stereocentres as rows (centre, a, b, c), `(k, 4)`, neighbours in canonical order.
-
-    The sign of `geometry.signed_volumes` for a row is the centre's handedness, the same for one molecule in any atom
-    order and opposite for its mirror image.
-    """
+    """Return the stereocentres as rows (centre, a, b, c), `(k, 4)`, neighbours in canonical order: the sign of
+    `geometry.signed_volumes` is the same for one molecule in any atom order and opposite for its mirror image."""
     return np.array(classify(scene).centres, dtype=np.int64).reshape(-1, 4)
 
 
@@ -264,8 +252,7 @@ def backbone_torsions(scene: Scene) -> dict[str, IntArray]:
     """Return the peptide torsions `phi`, `psi`, `omega`, each `(k, 4)`, ordered along the chain.
 
     Found from the graph: C(=O)-N-CA-C(=O) and N-CA-C(=O)-N, with omega (X, C, N, Y) about every C(=O)-N bond between
-    carbons X and Y (caps included). CA has no multiple bond in a ring: caffeine and picolinamide are no peptides. Names
-    and residues play no part; scenes without peptides give empty arrays.
+    carbons (caps included). CA has no multiple bond in a ring: caffeine and picolinamide are no peptides.
     """
     graph = bonded_graph(scene)
     symbol = scene.elements
@@ -349,8 +336,8 @@ def turned(positions_nm: FloatArray, quad: Sequence[int], angle: float, graph: n
 
 
 def turn_torsions(scene: Scene, states_nm: FloatArray, every: int, rng: np.random.Generator) -> None:
-    """Turn one torsion, rotors' too, of each `every`-th of the states `(n, n_atoms, 3)` nm to any angle, in place;
-    where atoms would collide a state is left as it is."""
+    """Turn one torsion, rotors' too, of each `every`-th of the states `(n, n_atoms, 3)` nm to any angle, in place,
+    where no atoms collide."""
     torsions, graph = rotatable_torsions(scene, rotors=True), bonded_graph(scene)
     for k in range(0, len(states_nm) if len(torsions) else 0, every):
         quad = torsions[rng.integers(len(torsions))]
@@ -361,11 +348,9 @@ def turn_torsions(scene: Scene, states_nm: FloatArray, every: int, rng: np.rando
 
 
 def rotatable_torsions(scene: Scene, *, rotors: bool = False) -> IntArray:
-    """Return one torsion per rotatable bond, `(k, 4)`, sorted by its middle bond.
-
-    Rotatable: single, in no ring, no amide C-N, heavy atoms beyond both ends. `rotors` adds bonds to groups whose only
-    further atoms are hydrogens (methyl, hydroxyl, NH3). The outer atoms are heavy where they can be.
-    """
+    """Return one torsion per rotatable bond, `(k, 4)`, sorted by its middle bond: single, in no ring, no amide C-N,
+    heavy atoms beyond both ends. `rotors` adds bonds to groups whose only further atoms are hydrogens. The outer atoms
+    are heavy where they can be."""
     graph = bonded_graph(scene)
     in_ring = {(i, j) for i, j in ring_bonds(scene).tolist()}
     amide = {(min(r[1], r[2]), max(r[1], r[2])) for r in backbone_torsions(scene)["omega"].tolist()}
@@ -397,10 +382,9 @@ def match_atoms(scene: Scene, template: Scene) -> IntArray:
     """Return `order (n_atoms,)` such that template atom k is scene atom `order[k]`.
 
     Elements, connectivity, total charge and stereo must agree; names, order, residues and bond orders play no part.
-    Of the equivalent assignments one is taken in which every four-coordinate atom keeps its handedness, prochiral
-    groups and methyl hydrogens included, so that `positions_nm[order]` superposes on the template with no group
-    inverted; rotors and planar NH2 take the labelling nearest in torsion. Particles of a model system are matched in
-    their order. Raises OutOfDomainError with the reason.
+    Every four-coordinate atom keeps its handedness, prochiral groups and methyl hydrogens included, so that
+    `positions_nm[order]` superposes on the template with no group inverted; rotors and planar NH2 take the labelling
+    nearest in torsion. Particles of a model system are matched in their order. Raises OutOfDomainError with the reason.
     """
     if scene.interactions != template.interactions:
         raise OutOfDomainError(f"{scene.name} and {template.name} are under different laws: not the same model system.")
@@ -460,11 +444,8 @@ def _positive(positions_nm: FloatArray, quads: list[list[int]], planar: bool) ->
 
 
 def _match_skeletons(ours: _Side, theirs: _Side, check_planar: bool) -> dict[int, int] | None:
-    """Depth-first search over all atoms but terminal hydrogens, in breadth-first order, checking geometry as it goes.
-
-    Colours leave a choice only among equivalent atoms, and breadth-first order puts these side by side, so a wrong
-    choice shows within a few atoms; `_PATIENCE` bounds what is left.
-    """
+    """Depth-first search over all atoms but terminal hydrogens, in breadth-first order, which puts equivalent atoms
+    side by side: a wrong choice shows within a few atoms. `_PATIENCE` bounds what is left."""
     atoms = _walk(theirs)
     rank = {i: k for k, (i, _) in enumerate(atoms)}
     checks: dict[int, list[_Check]] = {}
@@ -512,24 +493,16 @@ def _match_skeletons(ours: _Side, theirs: _Side, check_planar: bool) -> dict[int
 
 def _walk(side: _Side) -> list[tuple[int, int | None]]:
     """Atoms but terminal hydrogens in breadth-first order, rare classes first, each with its parent."""
-    kept = [i for i in range(len(side.near)) if i not in side.leaves]
-    count: dict[int, int] = {}
-    for i in kept:
-        count[side.colours[i]] = count.get(side.colours[i], 0) + 1
-    out: list[tuple[int, int | None]] = []
-    seen: set[int] = set()
+    kept = nx.Graph()
+    kept.add_nodes_from(i for i in range(len(side.near)) if i not in side.leaves)
+    kept.add_edges_from((i, j) for i in list(kept) for j in side.near[i] if j not in side.leaves)
+    count = Counter(side.colours[i] for i in kept)
+    parents: dict[int, int | None] = {}
     for start in sorted(kept, key=lambda i: (count[side.colours[i]], i)):
-        if start in seen:
-            continue
-        queue: list[tuple[int, int | None]] = [(start, None)]
-        seen.add(start)
-        for atom, parent in queue:
-            out.append((atom, parent))
-            for j in side.near[atom]:
-                if j not in seen and j not in side.leaves:
-                    seen.add(j)
-                    queue.append((j, atom))
-    return out
+        if start not in parents:
+            parents[start] = None
+            parents.update((atom, parent) for parent, atom in nx.bfs_edges(kept, start))
+    return list(parents.items())
 
 
 def _checks(side: _Side, kept: set[int], check_planar: bool) -> Iterator[_Check]:

@@ -1,8 +1,7 @@
 """Residues of chains: heavy atoms, bonds, hydrogens that must be there, and the names other programs give them.
 
-Standard ones stand here; `template_for` goes first. The others are those of the chemical component dictionary: their
-data (systems/library/data/components.tsv.gz) come from the wwPDB's, which is in the public domain (CC0), by
-docs/studies/preparation/component_subset.py.
+They are those of the chemical component dictionary: the data (systems/library/data/components.tsv.gz) come from the
+wwPDB's, which is in the public domain (CC0), by docs/studies/preparation/component_subset.py.
 """
 
 from __future__ import annotations
@@ -10,41 +9,29 @@ from __future__ import annotations
 import gzip
 import re
 from collections.abc import Collection, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from importlib.resources import files
+from typing import cast
 
-_BACKBONE = "N-CA CA-C C-O"
-# Side-chain bonds, and the least number of hydrogens on each heavy atom (protonation may add to it).
-_SIDE_CHAINS: dict[str, tuple[str, str]] = {
-    "ALA": ("CA-CB", "CB3"),
-    "ARG": ("CA-CB CB-CG CG-CD CD-NE NE-CZ CZ-NH1 CZ-NH2", "CB2 CG2 CD2 NE1 NH11 NH21"),
-    "ASN": ("CA-CB CB-CG CG-OD1 CG-ND2", "CB2 ND22"),
-    "ASP": ("CA-CB CB-CG CG-OD1 CG-OD2", "CB2"),
-    "CYS": ("CA-CB CB-SG", "CB2"),
-    "GLN": ("CA-CB CB-CG CG-CD CD-OE1 CD-NE2", "CB2 CG2 NE22"),
-    "GLU": ("CA-CB CB-CG CG-CD CD-OE1 CD-OE2", "CB2 CG2"),
-    "GLY": ("", ""),
-    "HIS": ("CA-CB CB-CG CG-ND1 CG-CD2 ND1-CE1 CD2-NE2 CE1-NE2", "CB2 CD21 CE11"),
-    "ILE": ("CA-CB CB-CG1 CB-CG2 CG1-CD1", "CB1 CG12 CG23 CD13"),
-    "LEU": ("CA-CB CB-CG CG-CD1 CG-CD2", "CB2 CG1 CD13 CD23"),
-    "LYS": ("CA-CB CB-CG CG-CD CD-CE CE-NZ", "CB2 CG2 CD2 CE2 NZ2"),
-    "MET": ("CA-CB CB-CG CG-SD SD-CE", "CB2 CG2 CE3"),
-    "PHE": ("CA-CB CB-CG CG-CD1 CG-CD2 CD1-CE1 CD2-CE2 CE1-CZ CE2-CZ", "CB2 CD11 CD21 CE11 CE21 CZ1"),
-    "PRO": ("CA-CB CB-CG CG-CD CD-N", "CB2 CG2 CD2"),
-    "SER": ("CA-CB CB-OG", "CB2 OG1"),
-    "THR": ("CA-CB CB-OG1 CB-CG2", "CB1 OG11 CG23"),
-    "TRP": (
-        "CA-CB CB-CG CG-CD1 CG-CD2 CD1-NE1 NE1-CE2 CD2-CE2 CD2-CE3 CE3-CZ3 CZ3-CH2 CH2-CZ2 CZ2-CE2",
-        "CB2 CD11 NE11 CE31 CZ31 CH21 CZ21",
-    ),
-    "TYR": ("CA-CB CB-CG CG-CD1 CG-CD2 CD1-CE1 CD2-CE2 CE1-CZ CE2-CZ CZ-OH", "CB2 CD11 CD21 CE11 CE21 OH1"),
-    "VAL": ("CA-CB CB-CG1 CB-CG2", "CB1 CG13 CG23"),
-}
-_CAPS: dict[str, tuple[str, str]] = {
+import networkx as nx
+
+from systems.chemistry.graph import ring_sizes
+
+# The least numbers of hydrogens that differ from what the dictionary leaves a residue at the highest pH: a lone charge
+# may be drawn on either nitrogen, sulfur may be bridged.
+_FEWEST_HYDROGENS = {"ARG": {"NH1": 1, "NH2": 1}, "CYS": {"SG": 0}, "HIS": {"NE2": 0}, "LYS": {"NZ": 2}}
+# Bonds, and the least number of hydrogens on each heavy atom: of caps, and of residues whose rings are built in the
+# order of these bonds.
+_WRITTEN: dict[str, tuple[str, str]] = {
     "ACE": ("CH3-C C-O", "CH33"),
     "NME": ("N-C", "N1 C3"),
     "NH2": ("", "N2"),
+    "PRO": ("N-CA CA-C C-O CA-CB CB-CG CG-CD CD-N", "CA1 CB2 CG2 CD2"),
+    "TRP": (
+        "N-CA CA-C C-O CA-CB CB-CG CG-CD1 CG-CD2 CD1-NE1 NE1-CE2 CD2-CE2 CD2-CE3 CE3-CZ3 CZ3-CH2 CH2-CZ2 CZ2-CE2",
+        "CA1 CB2 CD11 NE11 CE31 CZ31 CH21 CZ21",
+    ),
 }
 _RESIDUE_ALIASES = {
     "HID": "HIS", "HIE": "HIS", "HIP": "HIS", "HSD": "HIS", "HSE": "HIS", "HSP": "HIS", "HISD": "HIS", "HISE": "HIS",
@@ -92,13 +79,7 @@ def template_for(residue_name: str) -> ResidueTemplate | None:
     name = _RESIDUE_ALIASES.get(name, name)
     if len(name) == 4 and name[0] in "NC":  # Amber's terminal forms
         name = _RESIDUE_ALIASES.get(name[1:], name[1:])
-    if name in _SIDE_CHAINS:
-        side, hydrogens = _SIDE_CHAINS[name]
-        counts = {"CA": 2 if name == "GLY" else 1}
-        return _template(name, f"{_BACKBONE} {side}", hydrogens, counts)
-    if name in _CAPS:
-        return _template(name, *_CAPS[name], {})
-    return None
+    return _template(name) if name in _WRITTEN or name in ONE_LETTER.values() else None
 
 
 def canonical_heavy_name(template: ResidueTemplate, name: str) -> str | None:
@@ -121,16 +102,20 @@ def is_water_name(residue_name: str) -> bool:
 
 def amino_acid_names() -> list[str]:
     """Three-letter names of the twenty."""
-    return list(_SIDE_CHAINS)
+    return list(ONE_LETTER.values())
 
 
-def _template(name: str, bonds: str, hydrogens: str, counts: dict[str, int]) -> ResidueTemplate:
-    pairs = [tuple(b.split("-")) for b in bonds.split()]
-    heavy = list(dict.fromkeys(a for pair in pairs for a in pair)) or ["N"]
-    counts = counts | {h[:-1]: int(h[-1]) for h in hydrogens.split()}
-    return ResidueTemplate(
-        name, tuple(heavy), tuple((a, b) for a, b in pairs), counts, is_amino_acid=name in _SIDE_CHAINS
-    )
+@cache
+def _template(name: str) -> ResidueTemplate:
+    if name in _WRITTEN:
+        bonds, hydrogens = _WRITTEN[name]
+        pairs = tuple((a, b) for a, b in (bond.split("-") for bond in bonds.split()))
+        heavy = tuple(dict.fromkeys(atom for pair in pairs for atom in pair)) or ("N",)
+        least = {h[:-1]: int(h[-1]) for h in hydrogens.split()}
+        return ResidueTemplate(name, heavy, pairs, least, is_amino_acid=name in ONE_LETTER.values())
+    found = cast(Component, component(name)).template
+    least = found.hydrogens | {"N": 0} | _FEWEST_HYDROGENS.get(name, {})
+    return replace(found, hydrogens={atom: n for atom, n in least.items() if n})
 
 
 # ---- the chemical component dictionary ------------------------------------------------------------------------------
@@ -149,11 +134,9 @@ PH_OF_FEWEST = 14.0
 
 @dataclass(frozen=True)
 class Component:
-    """A residue as the dictionary has it, mostly uncharged and alone.
-
-    Per heavy atom: name, element, formal charge and the names of its hydrogens, those first that leave when the residue
-    is linked. `bonds`: pairs of heavy atoms with their order. `kind`: peptide, nucleotide or saccharide.
-    """
+    """A residue as the dictionary has it, mostly uncharged and alone. Per heavy atom: name, element, formal charge and
+    the names of its hydrogens, those first that leave when the residue is linked. `bonds`: pairs of heavy atoms with
+    their order. `kind`: peptide, nucleotide or saccharide."""
 
     name: str
     kind: str
@@ -208,22 +191,16 @@ def component(name: str) -> Component | None:
 
 def known_template(residue_name: str) -> ResidueTemplate | None:
     """Return the template of a standard residue, or that of a component of the dictionary, or None."""
-    standard = template_for(residue_name)
-    if standard is not None:
-        return standard
     found = component(residue_name)
-    return None if found is None else found.template
+    return template_for(residue_name) or (found.template if found else None)
 
 
 def hydrogens_of(
     residue: Component, present: Collection[str], links: Mapping[str, int], *, ph: float
 ) -> list[tuple[str, str]]:
-    """Return (name, heavy atom) of each hydrogen of a residue with these heavy atoms `present` at this pH.
-
-    `links`: how many bonds each heavy atom has to other residues. Each takes the place of a hydrogen, or of an atom
-    that leaves (OXT). Groups are charged by their usual pKa: carboxylic, phosphoric and sulfuric acids, amines,
-    guanidines and imidazoles.
-    """
+    """Return (name, heavy atom) of each hydrogen of a residue with these heavy atoms `present` at this pH, groups
+    charged by their usual pKa. `links`: how many bonds each heavy atom has to other residues; each takes the place of a
+    hydrogen, or of an atom that leaves (OXT)."""
     near: list[list[tuple[int, int]]] = [[] for _ in residue.heavy]
     for i, j, order in residue.bonds:
         near[i].append((j, order))
@@ -256,7 +233,7 @@ def _ionise(
 ) -> None:
     """Add to and take from the hydrogens of titratable groups."""
     symbol = residue.elements
-    ring = _ring_bonds(residue)
+    ring = ring_sizes(nx.Graph([(i, j) for i, j, _ in residue.bonds]))
     acid_protons: dict[int, int] = {}
     for k, element in enumerate(symbol):
         if element == "O" and counts[k] and len(near[k]) == 1:
@@ -279,25 +256,12 @@ def _ionise(
                 others = [n for n, _ in near[j] if symbol[n] == "N" and n != k]
                 if order != 2 or symbol[j] != "C" or not others:
                     continue
-                in_ring = frozenset((j, k)) in ring
+                bond = min(j, k), max(j, k)
+                in_ring = bond in ring
                 if residue.charges[k] == 0 and not in_ring:  # guanidine, amidine
                     counts[k] += ph < _PKA_GUANIDINE
-                elif residue.charges[k] == 1 and in_ring and ring[frozenset((j, k))] == 5 and counts[k]:
+                elif residue.charges[k] == 1 and in_ring and ring[bond] == 5 and counts[k]:
                     counts[k] -= ph > _PKA_IMIDAZOLE
-
-
-def _ring_bonds(residue: Component) -> dict[frozenset[int], int]:
-    """Return the bonds in rings, with the size of the smallest ring found about each."""
-    import networkx as nx
-
-    graph: nx.Graph = nx.Graph([(i, j) for i, j, _ in residue.bonds])
-    out: dict[frozenset[int], int] = {}
-    for cycle in nx.minimum_cycle_basis(graph):
-        members = set(cycle)
-        for i, j, _ in residue.bonds:
-            if {i, j} <= members:
-                out[frozenset((i, j))] = min(len(cycle), out.get(frozenset((i, j)), len(cycle)))
-    return out
 
 
 @cache

@@ -1,7 +1,5 @@
-"""Validity of frames: NumPy checks of bonds, clashes, chirality and planarity, for guards and for the comparison, by
-the geometry of a scene or of reference frames. For guards also limits of angles, flat centres, jumps, stillness and
-drift: the farthest that the reference goes from its mean, and half as far again; the least it changes, and a third.
-"""
+"""Validity of frames: bonds, clashes, chirality and planarity by the geometry of a scene or of reference frames, for
+guards and for the comparison; and limits of the reference's angles, flat centres and steps, for guards alone."""
 
 from __future__ import annotations
 
@@ -13,7 +11,7 @@ from typing import Annotated, Any
 import numpy as np
 import numpy.typing as npt
 
-from systems.chemistry.geometry import column_blocks, cross, signed_volume, squared_distance, torsion_cosine
+from systems.chemistry.geometry import bond_angle, column_blocks, cross, signed_volume, squared_distance, torsion_cosine
 from systems.errors import InputError
 from systems.files.schema import Recorded
 from systems.scene import Scene
@@ -76,12 +74,12 @@ _NAMES = {
 class Geometry(Recorded):
     """What a valid frame keeps. Made by `geometry_from_scene` or `geometry_from_frames`.
 
-    Atoms: `hydrogen (n_atoms,)` 1 for hydrogens. Bonds: `bond_idx (n_bonds, 2)`, `bond_mean_nm`, `bond_std_nm`
-    `(n_bonds,)` (0 where no frames were given). Clashes: `near_idx (k, 2)` are the pairs up to three bonds apart, which
-    never count; `clash_min_nm (3,)` the least distance of all others: between hydrogens, hydrogen and heavy, heavy.
-    Handedness: `stereo_idx (k, 4)` rows (centre, a, b, c), `stereo_sign (k,)` of their signed volume. Torsions about
-    peptide and double bonds: `omega_idx (k, 4)` with `omega_sign (k,)`, 1 for cis and -1 for trans. Planar rings:
-    `ring_idx (k, 4)`, the torsions within them. `excluded` says what is not checked because the reference changes it.
+    `hydrogen (n_atoms,)`: 1 for hydrogens. Bonds: `bond_idx (n_bonds, 2)`, `bond_mean_nm`, `bond_std_nm` `(n_bonds,)`
+    (0 where no frames were given). Clashes: `near_idx (k, 2)`, pairs up to three bonds apart, never count;
+    `clash_min_nm (3,)` is the least distance of others: between hydrogens, hydrogen and heavy, heavy. Handedness:
+    `stereo_idx (k, 4)` rows (centre, a, b, c), `stereo_sign (k,)` of their signed volume. Peptide and double bonds:
+    `omega_idx (k, 4)`, `omega_sign (k,)`, 1 for cis and -1 for trans. Planar rings: `ring_idx (k, 4)`, the torsions
+    within them. `excluded`: what is not checked because the reference changes it.
     """
 
     hydrogen: IntArray
@@ -130,9 +128,8 @@ class Geometry(Recorded):
 def geometry_from_scene(scene: Scene) -> Geometry:
     """Return the geometry of a scene's starting positions, for use before there is a reference.
 
-    Clash distances are 0.2 nm between heavy atoms and 0.1 nm where a hydrogen takes part, for atoms more than three
-    bonds apart: the closest that unbonded heavy atoms come is the 0.24 nm of strong hydrogen bonds, and hydrogen
-    comes no closer than 0.15 nm to an acceptor, so no thermal frame is called a clash, and fused atoms are.
+    Clash distances are 0.2 nm between heavy atoms, which unbonded come no closer than the 0.24 nm of strong hydrogen
+    bonds, and 0.1 nm where a hydrogen takes part, which comes no closer than 0.15 nm to an acceptor.
     """
     from systems.chemistry.graph import exclusions, stereocentres
 
@@ -159,9 +156,8 @@ def geometry_from_frames(scene: Scene, positions_nm: npt.ArrayLike) -> Geometry:
 
     What differs from the majority in more than one frame in a thousand is left out and named in `.excluded` (a proton
     that hops, an amide that turns, a ring that buckles); frames that are not finite are not used. Clash distances are
-    0.8 times the least that the frames show for each kind of pair, and at most 0.24 nm between heavy atoms and 0.14 nm
-    with a hydrogen: the lengths of the shortest hydrogen bonds, which a short reference need not have visited.
-    Raises InputError when no finite frame fits the scene.
+    0.8 times the least that the frames show for each kind of pair, at most the lengths of the shortest hydrogen bonds,
+    which a short reference need not have visited. Raises InputError when no finite frame fits the scene.
     """
     frames = np.asarray(positions_nm)
     if frames.ndim != 3 or frames.shape[1:] != (scene.n_atoms, 3):
@@ -229,7 +225,7 @@ def n_pairs(n_atoms: int) -> int:
 def changed_stereo(scene: Scene, positions_nm: FloatArray) -> list[str]:
     """Return of each state `(n_states, n_atoms, 3)` nm what of the scene's handedness it has not, in words, empty where
     it has all: a stereocentre turned over, or a double bond gone from cis to trans or back. What the scene has flat may
-    go either way; amides turn without becoming another molecule."""
+    go either way."""
     from systems.chemistry.graph import stereocentres
 
     centres, torsions = stereocentres(scene), _stiff_torsions(scene)
@@ -253,10 +249,7 @@ def changed_stereo(scene: Scene, positions_nm: FloatArray) -> list[str]:
 
 def centres_without_hydrogen(scene: Scene, positions_nm: FloatArray) -> IntArray:
     """Return rows (centre, a, b, c), `(k, 4)`, of carbons whose hydrogen is not in the scene: three neighbours of three
-    kinds, and not flat in frames `(n_frames, n_atoms, 3)` nm.
-
-    The fourth neighbour lies where the three leave room, so that the sign of their volume is the handedness.
-    """
+    kinds, and not flat in frames `(n_frames, n_atoms, 3)` nm. The sign of the volume of the three is the handedness."""
     from systems.chemistry.graph import atom_classes
 
     neighbours = scene.neighbours()
@@ -305,10 +298,8 @@ def _stiff_torsions(scene: Scene) -> IntArray:
 
 
 def _flat_ring_torsions(scene: Scene, mean_cosine: Callable[[IntArray], FloatArray]) -> IntArray:
-    """Torsions `(k, 4)` inside rings of 4 to 7 atoms with at most three neighbours each that are planar.
-
-    `mean_cosine(quads)` gives the mean cosine of each torsion; a ring is planar when none lies beyond 20°.
-    """
+    """Torsions `(k, 4)` inside rings of 4 to 7 atoms with at most three neighbours each whose `mean_cosine(quads)` are
+    all within 20° of flat."""
     rows: list[tuple[int, ...]] = []
     for cycle in small_rings(scene, most_neighbours=3):
         torsions = [tuple(cycle[(k + m) % len(cycle)] for m in range(4)) for k in range(len(cycle))]
@@ -318,24 +309,17 @@ def _flat_ring_torsions(scene: Scene, mean_cosine: Callable[[IntArray], FloatArr
 
 
 def small_rings(scene: Scene, *, most_neighbours: int | None = None) -> list[list[int]]:
-    """Return the rings of 4 to 7 atoms, atoms in order: the smallest ring of each bond.
+    """Return the rings of 4 to 7 atoms, atoms in order: the smallest ring of each bond. `most_neighbours` leaves out
+    rings with an atom of more neighbours."""
+    import networkx as nx
 
-    `most_neighbours` leaves out rings with an atom of more neighbours.
-    """
     from systems.chemistry.graph import bonded_graph, ring_bonds
 
     graph = bonded_graph(scene)
     rings: dict[frozenset[int], list[int]] = {}
     for i, j in ring_bonds(scene).tolist():
-        before = {i: i}
-        layer = [i]
-        for _ in range(6):  # breadth first from i to j without the bond itself
-            layer = [
-                step
-                for atom in layer
-                for step in graph[atom]
-                if {atom, step} != {i, j} and step not in before and before.setdefault(step, atom) == atom
-            ]
+        without_bond = nx.restricted_view(graph, [], [(i, j)])
+        before = dict(nx.bfs_predecessors(without_bond, i, depth_limit=6))
         if j in before:
             ring = [j]
             while ring[-1] != i:
@@ -426,10 +410,9 @@ class Limits(Recorded):
 
     Angles: `angle_idx (k, 3)` rows (end, middle, end) within `angle_min_rad` and `angle_max_rad (k,)`. Flat centres:
     `flat_idx (k, 4)` rows (centre, a, b, c) no farther than `flat_max_nm (k,)` from the plane of a, b, c. Jumps:
-    `jump_idx (k, 2)` pairs of atoms, whose distances change from one frame to the next, `lag_ps` later, by no more than
-    `jump_max_nm`, root mean square, and no less than `jump_min_nm`. The middle of those
-    atoms moves no farther than `jump_max_nm` either: frames stand in one pose, so what it does beyond is drift; or no
-    farther than `drift_max_nm`, if that is more, where frames turn about a centre of mass that is elsewhere.
+    `jump_idx (k, 2)` pairs of atoms, whose distances change from one frame to the next by `jump_min_nm` to
+    `jump_max_nm`, root mean square; the middle of those atoms moves no farther than `jump_max_nm`, or than
+    `drift_max_nm`, if that is more.
     """
 
     angle_idx: Annotated[IntArray, (-1, 3)]
@@ -442,20 +425,10 @@ class Limits(Recorded):
     jump_min_nm: float = 0.0
     drift_max_nm: float = 0.0
 
-    @cached_property
-    def angle_cosines(self) -> tuple[FloatArray, FloatArray]:
-        """The least and the greatest cosine of each angle, `(k,)` each."""
-        least = np.where(self.angle_max_rad < np.pi, np.cos(self.angle_max_rad), -2.0)
-        greatest = np.where(self.angle_min_rad > 0.0, np.cos(self.angle_min_rad), 2.0)
-        return least, greatest
-
 
 def limits_from_frames(scene: Scene, positions_nm: npt.ArrayLike, next_nm: npt.ArrayLike) -> Limits:
     """Return the limits that reference frames `(n_frames, n_atoms, 3)` nm set; frame k is followed by `next_nm[k]`.
-
-    Frames that are not finite are not used. Raises InputError when the frames do not fit the scene or each other, or
-    none is finite.
-    """
+    Raises InputError when the frames do not fit the scene or each other, or none is finite."""
     first, second = np.asarray(positions_nm), np.asarray(next_nm)
     if first.ndim != 3 or first.shape[1:] != (scene.n_atoms, 3) or second.shape != first.shape:
         raise InputError(f"Frames {first.shape} and {second.shape} do not fit each other and {scene.n_atoms} atoms.")
@@ -468,7 +441,7 @@ def limits_from_frames(scene: Scene, positions_nm: npt.ArrayLike, next_nm: npt.A
     angle_idx = np.array(triples, dtype=np.int64).reshape(-1, 3)
     quads = [(i, *around) for i, around in enumerate(near) if len(around) == 3]
     centres = np.array(quads, dtype=np.int64).reshape(-1, 4)
-    angles = np.arccos(np.clip(_gather(first, angle_idx, _angle_cosine), -1.0, 1.0))
+    angles = _gather(first, angle_idx, bond_angle)
     heights = np.abs(_gather(first, centres, _height))
     flat = np.sqrt((heights**2).mean(axis=1)) < _FLAT_NM
     mean = angles.mean(axis=1)
@@ -490,19 +463,19 @@ def check_limits(positions_nm: npt.ArrayLike, limits: Limits, previous_nm: npt.A
     """Return bits `(n_frames,)` for frames `(n_frames, n_atoms, 3)` nm; 0 is within the limits.
 
     ANGLE and PLANARITY: an angle, or a centre's height above the plane of its neighbours, beyond the limits. JUMP and
-    DRIFT: too far from the frame before, `previous_nm (n_frames, n_atoms, 3)`; STILL: too near to it, but not equal; a
-    frame without one before is its own. A frame that is not finite is beyond every limit, and so is the step away.
+    DRIFT: too far from the frame before, `previous_nm (n_frames, n_atoms, 3)`; STILL: too near to it, but not equal. A
+    frame that is not finite is beyond every limit, and so is the step away.
     """
     positions, previous = np.asarray(positions_nm), np.asarray(previous_nm)
     flags = np.zeros(len(positions), dtype=np.uint16)
-    least, greatest = (bound[:, None] for bound in limits.angle_cosines)
+    least, greatest = limits.angle_min_rad[:, None], limits.angle_max_rad[:, None]
     atoms = np.unique(limits.jump_idx)
     widest = max(len(limits.angle_idx), len(limits.flat_idx), len(limits.jump_idx))
     with np.errstate(invalid="ignore", over="ignore", divide="ignore"):
         for start, before, columns in _both(previous, positions, widest):
             part = flags[start : start + columns.shape[2]]
-            cosine = _angle_cosine(columns, limits.angle_idx)
-            part |= np.uint16(ANGLE) * ~((cosine >= least) & (cosine <= greatest)).all(axis=0)
+            angle = bond_angle(columns, limits.angle_idx)
+            part |= np.uint16(ANGLE) * ~((angle >= least) & (angle <= greatest)).all(axis=0)
             height = np.abs(_height(columns, limits.flat_idx))
             part |= np.uint16(PLANARITY) * ~(height <= limits.flat_max_nm[:, None]).all(axis=0)
             if len(atoms):
@@ -532,14 +505,6 @@ def _gather(frames: FloatArray, rows: IntArray, measure: Any) -> FloatArray:
 def _both(first: FloatArray, second: FloatArray, widest: int) -> Iterator[tuple[int, FloatArray, FloatArray]]:
     blocks = zip(column_blocks(first, widest), column_blocks(second, widest), strict=True)
     yield from ((start, a, b) for (start, a), (_, b) in blocks)
-
-
-def _angle_cosine(columns: FloatArray, triples: IntArray) -> FloatArray:
-    left = columns[:, triples[:, 0]] - columns[:, triples[:, 1]]
-    right = columns[:, triples[:, 2]] - columns[:, triples[:, 1]]
-    scale = np.sqrt((left * left).sum(axis=0) * (right * right).sum(axis=0))
-    cosine: FloatArray = (left * right).sum(axis=0) / np.maximum(scale, np.finfo(columns.dtype).tiny)
-    return cosine
 
 
 def _height(columns: FloatArray, quads: IntArray) -> FloatArray:

@@ -87,7 +87,7 @@ def test_training_data_are_the_complete_runs_with_the_right_hashes(finished: Pat
         suffix = "h5" if verb == ["windows"] else "safetensors"
         refused = run(*verb, str(finished), "-o", str(tmp_path / f"x.{suffix}"))
         assert refused.exit_code == 1
-        assert "ala_300K_r1.h5 is not the file that the campaign wrote" in refused.stderr
+        assert "ala_300K_r1.h5 is gone, or not the file that the campaign wrote" in refused.stderr
         assert not (tmp_path / f"x.{suffix}").exists()
 
 
@@ -109,8 +109,7 @@ def test_one_trains_on_a_campaign_s_folder(finished: Path, tmp_path: Path) -> No
     ("text", "said"),
     [
         (LONG + "temprature = '1K'", "unknown key 'temprature'. Did you mean 'temperature'?"),
-        (LONG + "[cluster]\nkind = 'slrm'", "Did you mean 'slurm'?"),
-        ("scenes = [", "cannot be read as TOML"),
+        ("scenes = [", "is not valid TOML"),
     ],
 )
 def test_a_file_that_cannot_be_meant_is_one_line(tmp_path: Path, text: str, said: str) -> None:

@@ -52,7 +52,7 @@ def energies(timestep_ps: float, *, kick_drift: bool = False, friction_per_ps: f
         for k in range(N_SAMPLES):
             engine.step(round(SAMPLE_PS / timestep_ps))
             state = engine.state()
-            times[k], totals[k] = state.time_ps, state.potential_kj_mol + state.kinetic_kj_mol
+            times[k], totals[k] = (k + 1) * SAMPLE_PS, state.potential_kj_mol + state.kinetic_kj_mol
         return times, totals, engine.n_dof
 
 

@@ -269,7 +269,7 @@ def test_contradictions_are_refused() -> None:
         solvate_if_asked(scene, ForceFieldSpec(), padding_nm=1.0)
     with pytest.raises(InputError, match="cell already"):
         solvate_if_asked(peptide_box(), TIP3P, padding_nm=1.0)
-    with pytest.raises(PreparationError, match="OPC"):
+    with pytest.raises(PreparationError, match="no solvent 'opc'"):
         ForceFieldSpec("charmm36", "opc")
     with pytest.raises(PreparationError, match="gfn2-xtb"):
         ForceFieldSpec("gfn2-xtb", "obc2")

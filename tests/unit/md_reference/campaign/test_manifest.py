@@ -73,7 +73,7 @@ def test_a_changed_or_missing_file_is_noticed_when_verified(folder: Path) -> Non
     file = folder / "a/350K/a_350K_r0.h5"
     file.write_bytes(b"frames 2")  # as long as it was
     campaign_trajectories(folder)
-    with pytest.raises(TrajectoryError, match=r"a_350K_r0\.h5 is not the file that the campaign wrote"):
+    with pytest.raises(TrajectoryError, match=r"a_350K_r0\.h5 is gone, or not the file"):
         campaign_trajectories(folder, verify=True)
     campaign_trajectories(folder / "a/300K", verify=True)
     file.unlink()

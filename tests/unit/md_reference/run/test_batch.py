@@ -49,7 +49,7 @@ def test_replicas_differ_and_say_how_they_were_made(tmp_path: Path) -> None:
 def test_what_was_stopped_goes_on_as_if_it_had_not_been(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     whole, parts = [tmp_path / "w0.h5", tmp_path / "w1.h5"], [tmp_path / "p0.h5", tmp_path / "p1.h5"]
     simulate_batch(SCENE, CONFIG, whole)
-    monkeypatch.setattr(replicas, "_BLOCK_S", 0.0)
+    monkeypatch.setattr(replicas._Batch, "block_s", 0.0)
 
     def stop(done: int, total: int, note: str | None = None) -> None:
         if note is None and done >= 6:
@@ -96,5 +96,5 @@ def test_what_simd_cannot_do_is_refused(tmp_path: Path, change: dict[str, object
 
 def test_the_plan_counts_replicas_that_run_at_once() -> None:
     one, many = (make_plan(SCENE, CONFIG, replicas=n) for n in (1, 16))
-    assert many.platform == "simd" and one.us_per_step is not None and many.us_per_step is not None
+    assert many.rows["platform"] == "simd" and one.us_per_step is not None and many.us_per_step is not None
     assert 8 < one.us_per_step / many.us_per_step < 32

@@ -9,7 +9,7 @@ import pytest
 from typer.testing import CliRunner
 
 import surrogate
-from md_reference.campaign.campaign_file import key_of, read_settings
+from md_reference.campaign.campaign_file import SETTINGS, read_settings
 from md_reference.run.config import defaults
 from surrogate import api
 from surrogate.cli import main
@@ -110,15 +110,14 @@ def test_settings_and_campaigns_have_the_same_names_and_the_help_their_defaults(
         if name in Preparation.__annotations__:
             assert (key, flag.default) == (name, switches[name].default)
             continue
-        # pressure_bar stands with its unit in a campaign's file, where it is a bare number.
-        assert key_of(name) == (name if name == "pressure_bar" else key)
+        assert SETTINGS[key].name == name
         text = flag.shown_default
         if flag.default is not None and flag.default != "default":
             assert flag.default == known[name], name
             continue
         value = flag.reader(text, name) if flag.reader else type(known[name])(text)
         assert value == pytest.approx(known[name]), name
-        assert read_settings({key_of(name): value if name == "pressure_bar" else text})
+        assert read_settings({key: text})
 
 
 def test_another_default_in_the_help_would_be_noticed(monkeypatch: pytest.MonkeyPatch) -> None:
