@@ -14,7 +14,8 @@ from systems.errors import UnitError
 GAS_CONSTANT_KJ_MOL_K = 8.31446261815324e-3
 # Minus the logarithm of how often chance may be taken for a blow-up.
 _UNLIKELINESS = 50.0
-# What a verb takes for a quantity: a number in the unit that the name ends in, or a text with its own: `10ns`.
+# What a verb takes for a quantity: a number in the unit that the name ends in, or a text with its own: `10ns`; also a
+# quantity of `openmm.unit`, which is not named here, for this package imports no simulator.
 Quantity = float | str
 
 # Both signs for micro: U+00B5, which keyboards type, and U+03BC, which other programs print.
@@ -50,7 +51,7 @@ DIMENSIONS = {
         {"M": 1.0, "mM": 1e-3, "mol/l": 1.0, "mol/L": 1.0, "": 1.0}, "M", "concentration", "0.15M", True
     ),
     "_bar": _Dimension({"bar": 1.0, "atm": 1.01325, "": 1.0}, "bar", "pressure", "1bar"),
-    "_s": _Dimension({"s": 1.0, "min": 60.0, "h": 3600.0}, "s", "budget", "30min"),
+    "_s": _Dimension({"s": 1.0, "min": 60.0, "h": 3600.0, "hr": 3600.0}, "s", "budget", "30min"),
 }  # fmt: skip
 
 
@@ -121,13 +122,16 @@ def quantity(name: str, value: None, what: str = ...) -> None: ...
 def quantity(name: str, value: Any, what: str = "") -> float | None:
     """Return what a setting called `name` (`time_ps`) is in the unit that its name ends in.
 
-    `value` is a number in that unit, or a text with its own, such as '10ns'; None stays None. `what`: how messages call
+    `value` is a number in that unit, a text with its own, such as '10ns', or a quantity of `openmm.unit`, whose
+    symbols are those of texts; None stays None. `what`: how messages call
     it, by default as it is called. Raises UnitError for another kind of value, and for a number that is negative or not
     finite.
     """
     if value is None:
         return None
     what = what or name
+    if hasattr(value, "value_in_unit"):
+        value = f"{float(value / value.unit)!r}{value.unit.get_symbol()}"
     if isinstance(value, str):
         return parser_of(name)(value, what)
     if isinstance(value, bool) or not isinstance(value, Real):

@@ -151,3 +151,36 @@ def test_only_what_has_a_unit_is_none_at_all(text: str, said: str) -> None:
 def test_what_is_no_quantity_is_refused_by_its_name(value: object) -> None:
     with pytest.raises(UnitError, match="time_ps"):
         quantity("time_ps", value)  # type: ignore[call-overload]
+
+
+@pytest.mark.parametrize(
+    ("name", "number", "of", "power", "expected"),
+    [
+        ("time_ps", 10, "nanosecond", 1, 10_000.0),
+        ("friction_per_ps", 0.1, "femtosecond", -1, 100.0),
+        ("temperature_k", 310, "kelvin", 1, 310.0),
+        ("hydrogen_mass_da", 3, "dalton", 1, 3.0),
+        ("padding_nm", 10, "angstrom", 1, 1.0),
+        ("ionic_strength_molar", 150, "millimolar", 1, 0.15),
+        ("pressure_bar", 1, "atmosphere", 1, 1.01325),
+        ("budget_s", 3, "minute", 1, 180.0),
+    ],
+)
+def test_quantities_of_openmm(name: str, number: float, of: str, power: int, expected: float) -> None:
+    from openmm import unit
+
+    assert quantity(name, number * getattr(unit, of) ** power) == pytest.approx(expected, rel=1e-9)
+
+
+def test_quantities_of_another_dimension_are_refused_in_one_line() -> None:
+    from openmm import unit
+
+    for name, value in (
+        ("time_ps", 3 * unit.kelvin),
+        ("friction_per_ps", 1 * unit.picosecond),
+        ("pressure_bar", 1 * unit.nanometer),
+        ("time_ps", -1 * unit.picosecond),
+    ):
+        with pytest.raises(UnitError, match=name) as caught:
+            quantity(name, value)
+        assert "\n" not in str(caught.value)
