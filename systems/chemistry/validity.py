@@ -86,8 +86,8 @@ class Geometry(Recorded):
     """What a valid frame keeps. Made by `geometry_from_scene` or `geometry_from_frames`.
 
     Atoms: `contact_class (n_atoms,)`, numbers into `CONTACT_CLASSES`. Bonds: `bond_idx (n_bonds, 2)`, `bond_mean_nm`,
-    `bond_std_nm (n_bonds,)` (0 where no frames were given). Clashes: `near_idx (k, 2)` are the pairs up to three bonds apart, which
-    never count; `clash_min_nm (n_classes, n_classes)` the least distance of all others, by their contact classes.
+    `bond_std_nm (n_bonds,)` (0 where no frames were given). Clashes: `near_idx (k, 2)` are the pairs up to three bonds
+    apart, which never count; `clash_min_nm (n_classes, n_classes)` the least distance of all others, by their classes.
     Handedness: `stereo_idx (k, 4)` rows (centre, a, b, c), `stereo_sign (k,)` of their signed volume. Torsions about
     peptide and double bonds: `omega_idx (k, 4)` with `omega_sign (k,)`, 1 for cis and -1 for trans. Planar rings:
     `ring_idx (k, 4)`, the torsions within them. `excluded` says what is not checked because the reference changes it.
