@@ -115,8 +115,7 @@ def cover_peptide(
     turning[chain.code.turning_at] = turning[chain.code.turning_at + 1] = True
     usual = chain.code.decode(torch.where(turning, tokens.flatten(), 0.0).reshape(tokens.shape))
     geometry = geometry_from_scene(standard.with_positions(usual.double().numpy()))
-    flags = int(check_frames(standard.positions_nm, geometry)[0]) & INVALID
-    if flags:
+    if flags := _flags_of_start(standard.positions_nm, geometry):
         reason = f"the starting structure is unlike frames of such residues ({', '.join(flag_names(flags))})"
         found.append(Deviation("start", reason, forcible=True))
     conditions = {
@@ -152,6 +151,8 @@ def _n_amino_acids(scene: Scene) -> int:
 
 
 _ROUNDING = 1e-6
+# How near atoms of a start may come, of how near those of frames may.
+_ROOM_OF_START = 0.85
 
 
 def choose_lag(weights: Weights, lag_ps: float | None, save_every_ps: float | None) -> float:
@@ -349,11 +350,17 @@ def _compare_sizes(scene: Scene, template: Scene) -> list[Deviation]:
 
 
 def _compare_start(scene: Scene, order: npt.NDArray[np.int64], geometry: Geometry) -> list[Deviation]:
-    flags = int(check_frames(scene.positions_nm[order], geometry)[0]) & INVALID
+    flags = _flags_of_start(scene.positions_nm[order], geometry)
     if not flags:
         return []
     reason = f"the starting structure is no frame of the training reference ({', '.join(flag_names(flags))})"
     return [Deviation("start", reason, forcible=not flags & NOT_FINITE)]
+
+
+def _flags_of_start(positions_nm: npt.NDArray[np.float64], geometry: Geometry) -> int:
+    """Return the flags of a start, whose atoms may be somewhat nearer than those of frames: it is no frame of MD."""
+    roomy = replace(geometry, clash_min_nm=_ROOM_OF_START * geometry.clash_min_nm)
+    return int(check_frames(positions_nm, roomy)[0]) & INVALID
 
 
 def _order_without_stereo(scene: Scene, template: Scene) -> npt.NDArray[np.int64] | None:

@@ -24,10 +24,19 @@ RING_BENT_COSINE = 0.5
 MAX_PAIRS = 40_000
 _RING_PLANAR_COSINE = float(np.cos(np.deg2rad(20.0)))
 _TOLERATED_SHARE = 1e-3
-# Between hydrogens, hydrogen and heavy atom, heavy atoms; nm. At most: the lengths of the shortest hydrogen bonds.
-_CLASH_WITHOUT_FRAMES_NM = (0.1, 0.1, 0.2)
-CLASH_AT_MOST_NM = (0.14, 0.14, 0.24)
-_CLASH_SHARE_OF_LEAST = 0.8
+# Classes of atoms by what they touch, the last for all other elements.
+CONTACT_CLASSES = ("hydrogen of N, O or S", "hydrogen of C", "C", "N", "O", "other")
+# Distance in nm below which atoms of two classes, more than three bonds apart, clash: 0.8 of the nearest that MD at
+# 300 K shows, rounded down (docs/studies/preparation/contacts.py), with room for ions and fluorine in the last row.
+CLASH_NM = np.array([
+    [0.114, 0.112, 0.150, 0.118, 0.126, 0.118],
+    [0.112, 0.140, 0.176, 0.172, 0.164, 0.160],
+    [0.150, 0.176, 0.228, 0.216, 0.206, 0.200],
+    [0.118, 0.172, 0.216, 0.220, 0.200, 0.190],
+    [0.126, 0.164, 0.206, 0.200, 0.200, 0.190],
+    [0.118, 0.160, 0.200, 0.190, 0.190, 0.190],
+])  # fmt: skip
+CLASH_SHARE_OF_LEAST = 0.8
 # Of unit vectors to three neighbours: 0.77 where a fourth is missing, 0 where there is none.
 _PYRAMID = 0.4
 _FRAMES_FOR_SHAPE = 200
@@ -74,20 +83,20 @@ _NAMES = {
 class Geometry(Recorded):
     """What a valid frame keeps. Made by `geometry_from_scene` or `geometry_from_frames`.
 
-    `hydrogen (n_atoms,)`: 1 for hydrogens. Bonds: `bond_idx (n_bonds, 2)`, `bond_mean_nm`, `bond_std_nm` `(n_bonds,)`
-    (0 where no frames were given). Clashes: `near_idx (k, 2)`, pairs up to three bonds apart, never count;
-    `clash_min_nm (3,)` is the least distance of others: between hydrogens, hydrogen and heavy, heavy. Handedness:
-    `stereo_idx (k, 4)` rows (centre, a, b, c), `stereo_sign (k,)` of their signed volume. Peptide and double bonds:
-    `omega_idx (k, 4)`, `omega_sign (k,)`, 1 for cis and -1 for trans. Planar rings: `ring_idx (k, 4)`, the torsions
-    within them. `excluded`: what is not checked because the reference changes it.
+    Atoms: `contact_class (n_atoms,)`, numbers into `CONTACT_CLASSES`. Bonds: `bond_idx (n_bonds, 2)`, `bond_mean_nm`,
+    `bond_std_nm (n_bonds,)` (0 where no frames were given). Clashes: `near_idx (k, 2)` are the pairs up to three bonds
+    apart, which never count; `clash_min_nm (n_classes, n_classes)` the least distance of all others, by their classes.
+    Handedness: `stereo_idx (k, 4)` rows (centre, a, b, c), `stereo_sign (k,)` of their signed volume. Torsions about
+    peptide and double bonds: `omega_idx (k, 4)` with `omega_sign (k,)`, 1 for cis and -1 for trans. Planar rings:
+    `ring_idx (k, 4)`, the torsions within them. `excluded` says what is not checked because the reference changes it.
     """
 
-    hydrogen: IntArray
+    contact_class: IntArray
     bond_idx: Annotated[IntArray, (-1, 2)]
     bond_mean_nm: FloatArray
     bond_std_nm: FloatArray
     near_idx: Annotated[IntArray, (-1, 2)]
-    clash_min_nm: FloatArray
+    clash_min_nm: Annotated[FloatArray, (-1, len(CONTACT_CLASSES))]
     stereo_idx: Annotated[IntArray, (-1, 4)]
     stereo_sign: IntArray
     omega_idx: Annotated[IntArray, (-1, 4)]
@@ -97,7 +106,7 @@ class Geometry(Recorded):
 
     @property
     def n_atoms(self) -> int:
-        return len(self.hydrogen)
+        return len(self.contact_class)
 
     @cached_property
     def clash_idx(self) -> IntArray:
@@ -111,13 +120,10 @@ class Geometry(Recorded):
         """The least distance in nm of each pair in `clash_idx`, `(k,)`."""
         return self.pair_min_nm(self.clash_idx)
 
-    def n_heavy(self, pairs: IntArray) -> IntArray:
-        """Return how many of each of the pairs `(k, 2)` are no hydrogens."""
-        return np.asarray(2 - self.hydrogen[pairs].sum(axis=1))
-
     def pair_min_nm(self, pairs: IntArray) -> FloatArray:
         """Return the least distance in nm for pairs `(k, 2)`."""
-        return np.asarray(self.clash_min_nm[self.n_heavy(pairs)])
+        one, other = self.contact_class[pairs].T
+        return np.asarray(self.clash_min_nm[one, other])
 
     @cached_property
     def near_keys(self) -> IntArray:
@@ -125,24 +131,31 @@ class Geometry(Recorded):
         return np.unique(self.near_idx[:, 0] * self.n_atoms + self.near_idx[:, 1])
 
 
-def geometry_from_scene(scene: Scene) -> Geometry:
-    """Return the geometry of a scene's starting positions, for use before there is a reference.
+def contact_classes(scene: Scene) -> IntArray:
+    """Return the class of each atom, `(n_atoms,)`, a number into `CONTACT_CLASSES`."""
+    number = {name: k for k, name in enumerate(CONTACT_CLASSES)}
+    found = [number.get(element, len(CONTACT_CLASSES) - 1) for element in scene.elements]
+    for i, around in enumerate(scene.neighbours()):
+        if scene.elements[i] == "H":
+            found[i] = int(any(scene.elements[j] == "C" for j in around))
+    return np.array(found, dtype=np.int64)
 
-    Clash distances are 0.2 nm between heavy atoms, which unbonded come no closer than the 0.24 nm of strong hydrogen
-    bonds, and 0.1 nm where a hydrogen takes part, which comes no closer than 0.15 nm to an acceptor.
-    """
+
+def geometry_from_scene(scene: Scene) -> Geometry:
+    """Return the geometry of a scene's starting positions, for use before there is a reference; clash distances are
+    `CLASH_NM`, below which no thermal frame comes."""
     from systems.chemistry.graph import exclusions, stereocentres
 
     start = np.ascontiguousarray(scene.positions_nm.T[:, :, None])
     stereo_idx, omega_idx = stereocentres(scene), _stiff_torsions(scene)
     return Geometry(
-        hydrogen=np.array([int(e == "H") for e in scene.elements], dtype=np.int64),
+        contact_class=contact_classes(scene),
         bond_idx=scene.bonds,
         bond_mean_nm=np.sqrt(squared_distance(start, scene.bonds)[:, 0]),
         bond_std_nm=np.zeros(len(scene.bonds)),
         near_idx=exclusions(scene, depth=3),
         # The particles of a model system have no size.
-        clash_min_nm=np.array(_CLASH_WITHOUT_FRAMES_NM) if scene.interactions is None else np.zeros(3),
+        clash_min_nm=CLASH_NM if scene.interactions is None else np.zeros_like(CLASH_NM),
         stereo_idx=stereo_idx,
         stereo_sign=np.where(signed_volume(start, stereo_idx)[:, 0] > 0, 1, -1),
         omega_idx=omega_idx,
@@ -156,8 +169,8 @@ def geometry_from_frames(scene: Scene, positions_nm: npt.ArrayLike) -> Geometry:
 
     What differs from the majority in more than one frame in a thousand is left out and named in `.excluded` (a proton
     that hops, an amide that turns, a ring that buckles); frames that are not finite are not used. Clash distances are
-    0.8 times the least that the frames show for each kind of pair, at most the lengths of the shortest hydrogen bonds,
-    which a short reference need not have visited. Raises InputError when no finite frame fits the scene.
+    0.8 times the least that the frames show for each pair of classes, and at most `CLASH_NM`: what a short reference
+    need not have visited. Raises InputError when no finite frame fits the scene.
     """
     frames = np.asarray(positions_nm)
     if frames.ndim != 3 or frames.shape[1:] != (scene.n_atoms, 3):
@@ -171,23 +184,22 @@ def geometry_from_frames(scene: Scene, positions_nm: npt.ArrayLike) -> Geometry:
     bonds, omega_idx = plain.bond_idx, plain.omega_idx
     stereo_idx = np.concatenate([plain.stereo_idx, centres_without_hydrogen(scene, frames)])
     mean, std = _bond_lengths(frames, bonds)
-    pairs: list[IntArray] = []
+    pairs: dict[tuple[int, int], IntArray] = {}
     if n_pairs(scene.n_atoms) <= MAX_PAIRS:
-        n_heavy = plain.n_heavy(plain.clash_idx)
-        pairs = [plain.clash_idx[n_heavy == n] for n in range(3)]
+        classes = np.sort(plain.contact_class[plain.clash_idx], axis=1)
+        pairs = {(a, b): plain.clash_idx[(classes == (a, b)).all(axis=1)] for a, b in np.unique(classes, axis=0)}
     n_broken, n_positive = np.zeros(len(bonds)), np.zeros(len(stereo_idx))
     n_cis, n_bent = np.zeros(len(omega_idx)), np.zeros(len(ring_idx))
-    least = np.full((3, len(frames)), np.inf)
-    for start, columns in column_blocks(frames, max([len(p) for p in pairs], default=0)):
+    least = {kind: np.empty(len(frames)) for kind in pairs}
+    for start, columns in column_blocks(frames, max(map(len, pairs.values()), default=0)):
         stop = start + columns.shape[2]
         length = np.sqrt(squared_distance(columns, bonds))
         n_broken += (np.abs(length - mean[:, None]) > HALF_ANGSTROM_NM).sum(axis=1)
         n_positive += (signed_volume(columns, stereo_idx) > 0).sum(axis=1)
         n_cis += (torsion_cosine(columns, omega_idx) > 0).sum(axis=1)
         n_bent += (torsion_cosine(columns, ring_idx) < RING_BENT_COSINE).sum(axis=1)
-        for n, idx in enumerate(pairs):
-            if len(idx):
-                least[n, start:stop] = np.sqrt(squared_distance(columns, idx).min(axis=0))
+        for kind, idx in pairs.items():
+            least[kind][start:stop] = np.sqrt(squared_distance(columns, idx).min(axis=0))
     n = len(frames)
     excluded: list[str] = []
 
@@ -205,10 +217,10 @@ def geometry_from_frames(scene: Scene, positions_nm: npt.ArrayLike) -> Geometry:
     keep_stereo = kept(stereo_idx, np.minimum(n_positive, n - n_positive), "stereocentre")
     keep_omega = kept(omega_idx, np.minimum(n_cis, n - n_cis), "peptide or double bond torsion")
     keep_ring = kept(ring_idx, n_bent, "ring torsion")
-    clash_min_nm = plain.clash_min_nm
-    if pairs and scene.interactions is None:
-        seen = np.quantile(least, _TOLERATED_SHARE, axis=1, method="lower")
-        clash_min_nm = np.minimum(_CLASH_SHARE_OF_LEAST * seen, CLASH_AT_MOST_NM)
+    clash_min_nm = plain.clash_min_nm.copy()
+    for (a, b), distances in least.items():
+        seen = float(np.quantile(distances, _TOLERATED_SHARE, method="lower"))
+        clash_min_nm[a, b] = clash_min_nm[b, a] = min(CLASH_SHARE_OF_LEAST * seen, clash_min_nm[a, b])
     return replace(
         plain, bond_idx=bonds[keep_bond], bond_mean_nm=mean[keep_bond], bond_std_nm=std[keep_bond],
         clash_min_nm=clash_min_nm, stereo_idx=stereo_idx[keep_stereo],

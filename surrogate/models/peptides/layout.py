@@ -20,7 +20,7 @@ from surrogate.models.peptides import chains
 from systems.chemistry.geometry import torsion
 from systems.chemistry.graph import backbone_torsions, bonded_graph, exclusions, match_atoms, ring_bonds
 from systems.chemistry.residues import template_for
-from systems.chemistry.validity import CLASH_AT_MOST_NM
+from systems.chemistry.validity import CLASH_NM, CLASH_SHARE_OF_LEAST, contact_classes
 from systems.errors import InputError, OutOfDomainError, PreparationError
 from systems.prepare.peptide import build_peptide
 from systems.scene import Scene
@@ -61,6 +61,8 @@ def standard_peptide(scene: Scene) -> tuple[Scene, npt.NDArray[np.int64]]:
     )
 
 
+# Of the nearest that atoms of two classes come in MD: where frames are mended or drawn again.
+_SHARE_OF_NEAREST = 0.96
 # A length that varies by less, by rounding alone, is one that the reference holds rigid.
 RIGID_NM = 2e-4
 # Before the first residue, and after the last.
@@ -299,10 +301,10 @@ def chain_features(scene: Scene, config: PeptideConfig) -> chains.ChainFeatures:
 
 
 def _least_distances(scene: Scene) -> torch.Tensor:
-    """Return how near atoms come that are more than three bonds apart, nm `(n_atoms, n_atoms)`: the lengths of the
-    shortest hydrogen bonds, as for the checks of frames (`systems.chemistry.validity`); 0 for all others."""
-    heavy = np.array([element != "H" for element in scene.elements], dtype=np.int64)
-    least = np.array(CLASH_AT_MOST_NM)[heavy[:, None] + heavy]
+    """Return how near atoms come that are more than three bonds apart, nm `(n_atoms, n_atoms)`: nearly as near as in MD
+    (checks of frames allow less, `systems.chemistry.validity`); 0 for all others."""
+    classes = contact_classes(scene)
+    least = _SHARE_OF_NEAREST / CLASH_SHARE_OF_LEAST * CLASH_NM[classes[:, None], classes]
     near = exclusions(scene, depth=3)
     least[near[:, 0], near[:, 1]] = least[near[:, 1], near[:, 0]] = 0.0
     np.fill_diagonal(least, 0.0)

@@ -16,6 +16,7 @@ from systems.chemistry.validity import (
     BOND_HALF_ANGSTROM,
     CHIRALITY,
     CLASH,
+    CLASH_NM,
     INVALID,
     NOT_FINITE,
     OMEGA,
@@ -79,8 +80,8 @@ def test_one_stray_frame_in_a_thousand_changes_no_rule(alanine_dipeptide: Scene)
 def test_clash_distances_from_frames(alanine_dipeptide: Scene) -> None:
     frames = wobbling(alanine_dipeptide, 50)
     geometry = geometry_from_frames(alanine_dipeptide, frames)
-    assert (geometry.clash_min_nm <= [0.14, 0.14, 0.24]).all()
-    assert (geometry.clash_min_nm > [0.1, 0.1, 0.18]).all()
+    assert (geometry.clash_min_nm <= CLASH_NM).all()
+    assert (geometry.clash_min_nm > 0.75 * CLASH_NM).all()
     i, j = geometry.clash_idx.T
     distance = np.linalg.norm(frames[:, i] - frames[:, j], axis=2)
     assert (distance.min(axis=0) >= geometry.clash_pair_min_nm / 0.8 - 1e-6).all()

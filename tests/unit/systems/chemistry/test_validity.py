@@ -13,15 +13,18 @@ from systems.chemistry.validity import (
     BOND_HALF_ANGSTROM,
     CHIRALITY,
     CLASH,
+    CONTACT_CLASSES,
     INVALID,
     NOT_FINITE,
     OMEGA,
     RING,
     Geometry,
     check_frames,
+    contact_classes,
     geometry_from_frames,
     geometry_from_scene,
 )
+from systems.library.named_scenes import prepare
 from systems.scene import Scene
 
 # ---- valid frames --------------------------------------------------------------------------------------------------
@@ -135,15 +138,27 @@ def test_a_free_torsion_may_turn(alanine_dipeptide: Scene, geometry: Geometry) -
             assert check_frames(moved, geometry)[0] & (OMEGA | CHIRALITY | BOND_HALF_ANGSTROM) == 0
 
 
+def test_contact_classes() -> None:
+    """Methanol's hydroxyl hydrogen is one that makes hydrogen bonds, its others are not."""
+    scene = prepare("smiles:CO")
+    classes = [CONTACT_CLASSES[k] for k in contact_classes(scene)]
+    of_hydrogen = sorted(c for c, e in zip(classes, scene.elements, strict=True) if e == "H")
+    assert of_hydrogen == ["hydrogen of C"] * 3 + ["hydrogen of N, O or S"]
+    assert [c for c in classes if "hydrogen" not in c] == [e for e in scene.elements if e != "H"]
+
+
 def test_clash(alanine_dipeptide: Scene, geometry: Geometry) -> None:
-    heavy = geometry.hydrogen[geometry.clash_idx].sum(axis=1) == 0
-    i, j = geometry.clash_idx[heavy][0].tolist()
-    with_h = geometry.hydrogen[geometry.clash_idx].sum(axis=1) == 1
-    k, m = geometry.clash_idx[with_h][0].tolist()
+    names = list(alanine_dipeptide.atom_names)
+    # The nearest that a methyl hydrogen may come to an oxygen is no hydrogen bond.
+    oxygen = names.index("O")
+    pairs = {tuple(p) for p in geometry.clash_idx.tolist()}
+    far = next(i for i in range(22) if alanine_dipeptide.elements[i] == "C" and (oxygen, i) in pairs)
+    hydrogen = next(i for i in range(22) if geometry.contact_class[i] == 1 and (oxygen, i) in pairs)
+    (i, j), (k, m) = (oxygen, far), (oxygen, hydrogen)
     frames = np.repeat(alanine_dipeptide.positions_nm[None], 4, axis=0)
     direction = np.array([1.0, 0.0, 0.0])
     for frame, (first, second, distance) in zip(
-        frames, [(i, j, 0.199), (i, j, 0.201), (k, m, 0.099), (k, m, 0.101)], strict=True
+        frames, [(i, j, 0.205), (i, j, 0.207), (k, m, 0.163), (k, m, 0.165)], strict=True
     ):
         frame[second] = frame[first] + distance * direction
     only_pair = Geometry.from_dict(

@@ -292,7 +292,11 @@ def test_atoms_overlap_where_they_are_nearer_than_md_lets_them_and_no_few_bonds_
     x[1, 2, far] = x[1, 2, oxygen] + torch.tensor([0.0, 0.0, 0.23])
     x[0, 1, far] = x[0, 1, oxygen] + torch.tensor([0.0, 0.0, 0.25])
     x[0, 0, at[0, "C"]] = x[0, 0, oxygen]  # bonded: for other checks
-    assert chain.overlap(x).tolist() == [[False, False, False], [False, False, True]]
+    # A methyl hydrogen makes no hydrogen bond, whose length an amide's may have.
+    methyl, amide = at[2, "H1"], at[2, "H"]
+    x[1, 0, methyl] = x[1, 0, oxygen] + torch.tensor([0.0, 0.0, 0.19])
+    x[1, 1, amide] = x[1, 1, oxygen] + torch.tensor([0.0, 0.0, 0.19])
+    assert chain.overlap(x).tolist() == [[False, False, False], [True, False, True]]
 
 
 def test_a_chunk_whose_atoms_overlap_is_drawn_again_in_the_same_states(monkeypatch: pytest.MonkeyPatch) -> None:
