@@ -371,7 +371,7 @@ def prepare(spec: str, options: Preparation) -> Scene:
     with the caps NME and ACE.
     Raises UnknownNameError, InputError or PreparationError, each in one line.
     """
-    from systems.prepare.mol2_file import is_peptide_mol2
+    from systems.prepare.mol2_file import is_peptide, read_mol2
     from systems.prepare.molecule import SUFFIXES
     from systems.prepare.records import suffix_of
     from systems.prepare.structure_file import prepare_file
@@ -391,7 +391,7 @@ def prepare(spec: str, options: Preparation) -> Scene:
     if text in names():
         return load(text)
     suffix = suffix_of(path)
-    if suffix in SUFFIXES and not (suffix == ".mol2" and is_peptide_mol2(path)):
+    if suffix in SUFFIXES and not (suffix == ".mol2" and is_peptide(read_mol2(path))):
         from systems.prepare.molecule import scene_from_mol_file
 
         return scene_from_mol_file(path)

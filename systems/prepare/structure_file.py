@@ -31,7 +31,7 @@ from systems.prepare.heterogens import (
     resolve_ligands,
     resolve_solvent,
 )
-from systems.prepare.mol2_file import read_peptide_mol2
+from systems.prepare.mol2_file import read_mol2
 from systems.prepare.records import (
     D_RESIDUES,
     AtomRecord,
@@ -68,7 +68,7 @@ def prepare_file(path: Path, options: Preparation) -> Scene:
 
 
 def _prepare_file(path: Path, options: Preparation) -> Scene:
-    found = read_peptide_mol2(path) if suffix_of(path) == ".mol2" else read_structure(path)
+    found = read_mol2(path) if suffix_of(path) == ".mol2" else read_structure(path)
     found = made_whole(found)
     repairs = list(found.notes)
     kept = _choose_alternates(found, repairs)

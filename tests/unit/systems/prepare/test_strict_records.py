@@ -42,13 +42,6 @@ def test_plain_notations_are_read(tmp_path: Path, ethanol_lines: list[str]) -> N
         _prepared(tmp_path, ethanol_lines)
 
 
-def test_an_atom_under_an_unknown_record_is_refused(tmp_path: Path, ethanol_lines: list[str]) -> None:
-    k = _row(ethanol_lines)
-    ethanol_lines[k] = "ATQM  " + ethanol_lines[k][6:]
-    with pytest.raises(InputError, match=rf"line {k + 1}: 'ATQM  '.*ATOM or HETATM"):
-        _prepared(tmp_path, ethanol_lines)
-
-
 def test_replaced_hydrogens_are_said(tmp_path: Path, repository: Path) -> None:
     """Without its carbonyl oxygen the chain ends at ALA 2, and the nitrogen after it gets other hydrogens."""
     lines = (repository / "systems" / "library" / "data" / "alanine-dipeptide.pdb").read_text().splitlines()
