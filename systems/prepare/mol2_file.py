@@ -25,7 +25,6 @@ _TWO_LETTERS = re.compile(r"cl|br|si|se", re.IGNORECASE)
 _FIRST_LETTERS = ("H", "B", "C", "N", "O", "F", "P", "S", "I")
 # Metals whose symbols begin no type of an organic atom.
 _METALS = ("Li", "Mg", "Al", "K", "Ti", "Mn", "Fe", "Zn", "Mo", "Ru", "Rh", "Pd", "Ag", "Pt", "Au")
-_NO_TYPE = ("du", "lp", "any", "hal", "het", "hev")
 _ORDERS = {"1": 1, "2": 2, "3": 3, "am": 1}
 # How far a sum of partial charges may be from a whole number and still mean it, and from the total without a word.
 _WHOLE = 0.05
@@ -105,8 +104,6 @@ def element_of(atom_type: str, name: str, *, alone: bool = False) -> str | None:
     where its name is one's.
     """
     head, dot, _ = atom_type.partition(".")
-    if head.lower() in _NO_TYPE:
-        return element_symbol(name, "LIG", "", hetero=True)
     ion = next((e for e in map(ion_symbol, (name, head)) if e is not None), None) if alone else None
     if ion is not None:
         return ion

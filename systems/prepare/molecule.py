@@ -355,6 +355,7 @@ def embed(molecule: Any, *, seed: int, notes: list[str]) -> Any:
     """
     from rdkit import Chem, rdBase
     from rdkit.Chem import rdDistGeom
+    from rdkit.Chem import rdForceFieldHelpers as force_fields
 
     out = Chem.Mol(molecule)
     out.RemoveAllConformers()
@@ -371,11 +372,14 @@ def embed(molecule: Any, *, seed: int, notes: list[str]) -> Any:
             "RDKit finds no 3-D geometry for it; its stereo or its rings may be impossible. Give an SDF with "
             "coordinates."
         )
-    _clean_up(out, notes)
+    with rdBase.BlockLogs():
+        if force_fields.MMFFHasAllMoleculeParams(out):
+            force_fields.MMFFOptimizeMolecule(out, maxIters=_CLEAN_UP_STEPS)
+        elif force_fields.UFFHasAllMoleculeParams(out):
+            force_fields.UFFOptimizeMolecule(out, maxIters=_CLEAN_UP_STEPS)
     labelled = Chem.Mol(out)
     Chem.AssignStereochemistryFrom3D(labelled)
-    _say_drawn(molecule, labelled, notes)
-    refuse_changed_stereo(molecule, labelled)
+    notes += compare_stereo(molecule, labelled)
     return out
 
 
@@ -398,8 +402,9 @@ def stereo_labels(molecule: Any) -> dict[tuple[int, ...], str]:
     return labels
 
 
-def refuse_changed_stereo(before: Any, after: Any) -> None:
-    """Raise PreparationError when an element of stereo specified in `before` has another label in `after`."""
+def compare_stereo(before: Any, after: Any) -> list[str]:
+    """Return a note for each element of stereo that `after` alone specifies. Raises PreparationError when one that is
+    specified in `before` has another label in `after`."""
     had, has = stereo_labels(before), stereo_labels(after)
     for where, label in had.items():
         if has.get(where) != label:
@@ -407,24 +412,7 @@ def refuse_changed_stereo(before: Any, after: Any) -> None:
                 f"{_where(before, where)} is {label} in the input and {has.get(where, 'flat')} in 3-D; "
                 "its stereo may be impossible. Give an SDF with coordinates."
             )
-
-
-def _say_drawn(before: Any, after: Any, notes: list[str]) -> None:
-    from rdkit import Chem
-
-    labels = stereo_labels(after)
-    for info in Chem.FindPotentialStereo(Chem.Mol(before)):
-        if info.specified == Chem.StereoSpecified.Specified:
-            continue
-        if info.type == Chem.StereoType.Bond_Double:
-            bond = before.GetBondWithIdx(info.centeredOn)
-            where = tuple(sorted((bond.GetBeginAtomIdx(), bond.GetEndAtomIdx())))
-        elif info.type == Chem.StereoType.Atom_Tetrahedral:
-            where = (info.centeredOn,)
-        else:
-            continue
-        if where in labels:
-            notes.append(f"{_where(before, where)} is not specified: drawn as {labels[where]}")
+    return [f"{_where(before, k)} is not specified: drawn as {label}" for k, label in has.items() if k not in had]
 
 
 def _where(molecule: Any, where: tuple[int, ...]) -> str:
@@ -434,22 +422,6 @@ def _where(molecule: Any, where: tuple[int, ...]) -> str:
         symbol = molecule.GetAtomWithIdx(i).GetSymbol()
         names.append(symbol + str(sum(molecule.GetAtomWithIdx(k).GetSymbol() == symbol for k in range(i + 1))))
     return f"stereocentre {names[0]}" if len(names) == 1 else f"double bond {'='.join(names)}"
-
-
-def _clean_up(molecule: Any, notes: list[str]) -> None:
-    """Relax in MMFF94, in UFF where it has no parameters, and say where neither has."""
-    from rdkit import rdBase
-    from rdkit.Chem import rdForceFieldHelpers as force_fields
-
-    if molecule.GetNumAtoms() < 2:
-        return
-    with rdBase.BlockLogs():
-        if force_fields.MMFFHasAllMoleculeParams(molecule):
-            force_fields.MMFFOptimizeMolecule(molecule, maxIters=_CLEAN_UP_STEPS)
-        elif force_fields.UFFHasAllMoleculeParams(molecule):
-            force_fields.UFFOptimizeMolecule(molecule, maxIters=_CLEAN_UP_STEPS)
-        else:
-            notes.append("neither MMFF94 nor UFF has parameters: the geometry is RDKit's embedding as it is")
 
 
 def sanitise(molecule: Any) -> None:

@@ -34,18 +34,14 @@ def suffix_of(path: Path) -> str:
 
 def read_text(path: Path, wanted: str) -> str:
     """Return the text of a file. Raises InputError, which asks for what is `wanted`, where it holds none."""
-    if path.is_dir():
-        raise InputError(f"{path} is a directory; give the file of {wanted}.")
     if not path.exists():
         raise InputError(f"{path} does not exist; check the path, or name a library system (`surromd systems`).")
     try:
         data = content(path)
     except (OSError, ValueError) as error:
         raise InputError(f"{path} cannot be read ({error}); check the file and its permissions.") from error
-    if not data.strip():
-        raise InputError(f"{path} is empty; give {wanted}.")
-    if b"\0" in data:
-        raise InputError(f"{path} is a binary file, no text; give {wanted}.")
+    if not data.strip() or b"\0" in data:
+        raise InputError(f"{path} is {'a binary file, no text' if data.strip() else 'empty'}; give {wanted}.")
     return data.decode("utf-8-sig", errors="replace").replace("\r\n", "\n")
 
 
@@ -172,11 +168,6 @@ class Bonding:
 # ---- modified residues ----------------------------------------------------------------------------------------------
 
 
-D_RESIDUES = {
-    "DAL": "ALA", "DAR": "ARG", "DSG": "ASN", "DAS": "ASP", "DCY": "CYS", "DGN": "GLN", "DGL": "GLU", "DHI": "HIS",
-    "DIL": "ILE", "DLE": "LEU", "DLY": "LYS", "MED": "MET", "DPN": "PHE", "DPR": "PRO", "DSN": "SER", "DTH": "THR",
-    "DTR": "TRP", "DTY": "TYR", "DVA": "VAL",
-}  # fmt: skip
 _CAP_BOND_ANGSTROM = 1.3
 # The patches ACE and CT3 of CHARMM write caps into the first and the last residue.
 _PATCHES = {"ACE": ("CAY", "CY", "OY"), "NME": ("NT", "CAT")}

@@ -50,7 +50,12 @@ def complete(
     residues = [r for chain in chains for r in chain]
     text = _heavy_atom_text(atoms, chains)
     neighbours = bonding.neighbours
-    closed = {r.key for chain in chains if _is_cycle(chain, bonding) for r in (chain[0], chain[-1])}
+    closed = {
+        end.key
+        for chain in chains
+        for end in (chain[0], chain[-1])
+        if (chain[-1].heavy.get("C", -1), chain[0].heavy.get("N", -1)) in bonding.peptide_bonds
+    }
     variants = [
         asked_hydrogens(residue, atoms, neighbours, ph=ph, in_cycle=residue.key in closed) for residue in residues
     ]
@@ -72,14 +77,10 @@ def complete(
         raise PreparationError(f"PDBFixer could not complete the structure ({first_line(error)}).") from error
     positions_nm = np.array(modeller.positions.value_in_unit(unit.nanometer), dtype=np.float64)
     records, bonds = records_from_openmm(modeller.topology, positions_nm, [r.key for r in residues])
-    _refuse_lost_bonds(records, bonds, atoms, bonding)
     names = {(r.key, a) for r in residues for a in r.heavy}
     records = _with_usual_lengths(records, bonds, names)
     records = _keep_hydrogens(records, bonds, atoms, bonding)
     summary = _summary(residues, records, ph) + rebuilt
-    replaced = _with_replaced_hydrogens(residues, records, atoms)
-    if replaced:
-        summary.append(f"hydrogens of the file replaced on {listed(replaced)}: their atoms have others now")
     summary += protonation_summary([r.label for r in residues], [r.key for r in residues], variants, records, ph)
     if [a.name for a in records if a.element != "H"] != [a.name for a in atoms if a.element != "H"]:
         summary.append("atoms stand in the standard order under their standard names")
@@ -183,10 +184,6 @@ def _chains(bonding: Bonding) -> list[list[Residue]]:
     return chains
 
 
-def _is_cycle(chain: Sequence[Residue], bonding: Bonding) -> bool:
-    return (chain[-1].heavy.get("C", -1), chain[0].heavy.get("N", -1)) in bonding.peptide_bonds
-
-
 def _heavy_atom_text(atoms: Sequence[AtomRecord], chains: Sequence[Sequence[Residue]]) -> str:
     lines: list[str] = []
     number = 0
@@ -261,23 +258,6 @@ def _with_usual_lengths(
     return out
 
 
-def _refuse_lost_bonds(
-    records: Sequence[AtomRecord],
-    bonds: IntArray,
-    atoms: Sequence[AtomRecord],
-    bonding: Bonding,
-) -> None:
-    """Every heavy-atom bond of the file must be there after the repair: cross-links other than disulfides are not."""
-    name_of = {i: (r.key, a) for r in bonding.residues for a, i in r.heavy.items()}
-    made = {frozenset((a.residue_key, a.name) for a in (records[i], records[j])) for i, j in bonds.tolist()}
-    for i, j in bonding.bonds.tolist():
-        if i in name_of and j in name_of and frozenset((name_of[i], name_of[j])) not in made:
-            raise PreparationError(
-                f"atoms are missing, and the bond {atoms[i].label} - {atoms[j].label} would be lost in "
-                "adding them; give the structure with all hydrogens."
-            )
-
-
 def _keep_hydrogens(
     records: list[AtomRecord], bonds: IntArray, atoms: Sequence[AtomRecord], bonding: Bonding
 ) -> list[AtomRecord]:
@@ -301,36 +281,22 @@ def _keep_hydrogens(
     return out
 
 
-def _with_replaced_hydrogens(
-    residues: Sequence[Residue], records: Sequence[AtomRecord], atoms: Sequence[AtomRecord]
-) -> list[str]:
-    """Labels of residues that had all their hydrogens and did not keep them: an end that became one, say."""
-    kept = {(a.residue_key, a.position_angstrom) for a in records if a.element == "H"}
-    return [
-        r.label
-        for r in residues
-        if not r.lacks_hydrogens
-        and any(atoms[i].element == "H" and (r.key, atoms[i].position_angstrom) not in kept for i in r.atoms)
-    ]
-
-
 def _summary(residues: Sequence[Residue], records: Sequence[AtomRecord], ph: float) -> list[str]:
     notes = []
     for residue in residues:
         if residue.missing:
             end = " (the chain ends here, as a carboxylate)" if "OXT" in residue.missing else ""
             notes.append(f"{residue.label}: added {' '.join(residue.missing)}{end}")
-    short = [r.label for r in residues if r.lacks_hydrogens]
-    by_dictionary = [r.label for r in residues if r.lacks_hydrogens and template_for(r.key[2]) is None]
+    short = {r.key: r.label for r in residues if r.lacks_hydrogens}
+    by_dictionary = [label for key, label in short.items() if template_for(key[2]) is None]
     if by_dictionary:
         notes.append(
             f"their hydrogens by the chemical component dictionary, groups charged as at pH {ph:g}: "
             f"{listed(by_dictionary)}"
         )
     if short:
-        of_short = {r.key for r in residues if r.lacks_hydrogens}
-        n = sum(a.element == "H" and a.residue_key in of_short for a in records)
-        notes.append(f"hydrogens placed on {listed(short)}: {n}")
+        n = sum(a.element == "H" and a.residue_key in short for a in records)
+        notes.append(f"hydrogens placed on {listed(list(short.values()))}: {n}")
     return notes
 
 
@@ -436,7 +402,7 @@ _STAGGERED = (-60.0, 180.0, 60.0)
 _PLANAR = tuple(float(k) for k in range(-180, 180, 30))
 # The atom at the end of the last torsion that turns a planar group.
 _PLANAR_AT = {"ASP": "CG", "ASN": "CG", "PHE": "CG", "TYR": "CG", "TRP": "CG", "HIS": "CG", "GLU": "CD", "GLN": "CD"}
-_RIGID = frozenset({frozenset(("NE", "CZ"))})
+_RIGID = frozenset(("NE", "CZ"))
 _BACKBONE = frozenset(("N", "C", "O", "OXT"))
 # Hydrogen bonds of heavy atoms start at 2.4 Å, contacts with carbon and sulfur at 3.0: nearer than the first an added
 # atom is built again, nearer than the second nothing is left to part.
@@ -516,20 +482,19 @@ def _conformers(name: str, there: Mapping[str, FloatArray], moved: Sequence[str]
     if name == "PRO" or any(a not in shape or a not in tree for a in moved) or not {"N", "CA", "CB"} <= set(there):
         return []
     order = [a for a in tree if a in moved]
-    axes: list[tuple[str, str, str, str, tuple[float, ...]]] = []
+    turning = {frozenset(bond) for bond in nx.bridges(_skeleton(name))} - {_RIGID}
+    axes: dict[tuple[str, str], tuple[str, str, tuple[float, ...]]] = {}
     for atom, (p, g, q) in tree.items():
-        if any(axis[1:3] == (g, p) for axis in axes) or frozenset((g, p)) in _RIGID:
-            continue
-        if _turns(name, g, p):
-            values: tuple[float, ...] = _PLANAR if _PLANAR_AT.get(name) == p else _STAGGERED
+        if (g, p) not in axes and frozenset((g, p)) in turning:
             fixed = next((b for b, (pb, _, _) in tree.items() if pb == p and b in there), None)
-            if fixed is not None:
-                values = (_torsion_deg(there, q, g, p, fixed),)
-            axes.append((q, g, p, fixed or atom, values))
+            if fixed is None:
+                axes[g, p] = q, atom, _PLANAR if _PLANAR_AT.get(name) == p else _STAGGERED
+            else:
+                axes[g, p] = q, fixed, (_torsion_deg(there, q, g, p, fixed),)
     out = []
-    for chosen in product(*(values for *_, values in axes)):
+    for chosen in product(*(values for *_, values in axes.values())):
         turn = {(g, p): value - _torsion_deg(shape, q, g, p, d)
-                for (q, g, p, d, _), value in zip(axes, chosen, strict=True)}  # fmt: skip
+                for ((g, p), (q, d, _)), value in zip(axes.items(), chosen, strict=True)}  # fmt: skip
         placed = dict(there)
         for atom in order:
             p, g, q = tree[atom]
@@ -558,13 +523,6 @@ def _tree(name: str) -> dict[str, tuple[str, str, str]]:
     graph = graph.subgraph([a for a in graph if a not in _BACKBONE])
     parent = {"CA": "N", **{b: a for a, b in nx.bfs_edges(graph, "CA")}}
     return {a: (parent[a], parent[parent[a]], parent[parent[parent[a]]]) for a in parent if a not in ("CA", "CB")}
-
-
-def _turns(name: str, a: str, b: str) -> bool:
-    """Whether the bond is in no ring."""
-    graph = _skeleton(name).copy()
-    graph.remove_edge(a, b)
-    return not nx.has_path(graph, a, b)
 
 
 def _torsion_deg(shape: Mapping[str, FloatArray], *names: str) -> float:

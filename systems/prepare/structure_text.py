@@ -44,10 +44,11 @@ def read_structure(path: Path) -> StructureFile:
     """
     text = structure_text(path)
     found = _read_mmcif(text, path) if is_mmcif(path) else _read_pdb(text, path)
-    if not found.atoms and "_atom_site_fract_x" in text.lower():
-        raise InputError(f"{path} is the CIF of a crystal, in fractions of its cell; give one molecule as SDF or PDB.")
     if not found.atoms:
-        raise InputError(f"{path} holds no ATOM or HETATM record; give a PDB or mmCIF file with coordinates.")
+        raise InputError(
+            f"{path} holds no ATOM or HETATM record (the CIF of a crystal, in fractions of its cell, has none); give a "
+            "PDB or mmCIF file with coordinates."
+        )
     for atom in found.atoms:
         if not all(abs(x) <= _FARTHEST_ANGSTROM for x in atom.position_angstrom):
             raise InputError(
@@ -66,7 +67,10 @@ def structure_text(path: Path) -> str:
     """Return the text of a PDB or mmCIF file. Raises InputError for what is none."""
     known = ", ".join((*_PDB_SUFFIXES, *_CIF_SUFFIXES))
     if path.is_file() and suffix_of(path) not in (*_PDB_SUFFIXES, *_CIF_SUFFIXES):
-        raise InputError(f"{path} has suffix {path.suffix!r}; structures are read from {known}, also gzipped.")
+        raise InputError(
+            f"{path} has suffix {path.suffix!r}; structures are read from {known} (also gzipped), molecules from "
+            ".sdf, .mol and .mol2."
+        )
     return read_text(path, f"a structure with coordinates ({known})")
 
 
@@ -279,11 +283,6 @@ def read_blocks(text: str, path: Path, category: str) -> list[Any]:
         raise InputError(f"{path} is no whole CIF ({reason}); the file is cut or damaged, fetch it again.") from error
 
 
-def is_component(text: str) -> bool:
-    """Whether mmCIF text defines a component and holds no structure."""
-    return "_chem_comp_atom." in text and "_atom_site." not in text
-
-
 def _read_mmcif(text: str, path: Path) -> StructureFile:
     import gemmi
 
@@ -360,14 +359,11 @@ def _cleaned(found: StructureFile, path: Path) -> StructureFile:
 
 def _repeated(atoms: Sequence[AtomRecord]) -> set[int]:
     """Atoms of the same residue, name and position as one before."""
-    first: dict[tuple[object, ...], tuple[float, float, float]] = {}
+    first: dict[tuple[object, ...], AtomRecord] = {}
     out = set()
     for i, atom in enumerate(atoms):
-        key = (*atom.residue_key, atom.name, atom.altloc, atom.element)
-        here = atom.position_angstrom
-        if key not in first:
-            first[key] = here
-        elif max(abs(a - b) for a, b in zip(first[key], here, strict=True)) < _SAME_ANGSTROM:
+        before = first.setdefault((*atom.residue_key, atom.name, atom.altloc, atom.element), atom)
+        if before is not atom and distance_angstrom(before, atom) < _SAME_ANGSTROM:
             out.add(i)
     return out
 
@@ -377,19 +373,16 @@ def _sites(atoms: Sequence[AtomRecord], gone: set[int]) -> set[int]:
     called D and the name of the atom they stand on."""
     found = set()
     for members in by_residue(atoms).values():
+        real = [j for j in members if atoms[j].element]
         for i in members:
-            name = atoms[i].name.upper()
-            is_unknown = not atoms[i].element
-            may_be_drude = name.startswith("D") and is_unknown
-            if i in gone or not (may_be_drude or _SITE.fullmatch(name)):
+            name, is_unknown = atoms[i].name.upper(), not atoms[i].element
+            if is_unknown and name.startswith("D"):
+                others, reach = [j for j in real if name[1:] == atoms[j].name.upper()], _DRUDE_ANGSTROM
+            elif _SITE.fullmatch(name):
+                others, reach = [j for j in real if j != i], math.inf if is_unknown else _SITE_ANGSTROM
+            else:
                 continue
-            others = [j for j in members if j != i and atoms[j].element]
-            if may_be_drude:
-                others = [j for j in others if name[1:] == atoms[j].name.upper()]
-            near = min((distance_angstrom(atoms[i], atoms[j]) for j in others), default=math.inf)
-            if near < (_DRUDE_ANGSTROM if may_be_drude else _SITE_ANGSTROM) or (
-                others and is_unknown and not may_be_drude
-            ):
+            if i not in gone and any(distance_angstrom(atoms[i], atoms[j]) < reach for j in others):
                 found.add(i)
     return found
 

@@ -185,5 +185,5 @@ def test_a_stated_link_holds_for_the_alternate_that_stays(tmp_path: Path) -> Non
 def test_the_cif_of_a_crystal_is_refused_as_such(tmp_path: Path) -> None:
     path = tmp_path / "x.cif"
     path.write_text("data_x\nloop_\n_atom_site_label\n_atom_site_fract_x\nC1 0.1\n")
-    with pytest.raises(InputError, match="the CIF of a crystal"):
+    with pytest.raises(InputError, match="the CIF of a crystal, in fractions of its cell, has none"):
         prepare(str(path))
