@@ -201,29 +201,23 @@ class _Bonds:
         """Bonds of the free atoms: within a residue whatever is near enough, to other residues what links polymers.
         Besides, amides of side chains, and the links of residues that are components of the dictionary."""
         linkable = free | {i for r in self.residues if r.heavy and template_for(r.key[2]) is None for i in r.atoms}
-        apart, amides = [], []
+        amides = []
         for i, j, d in self.near:
             first, second = self.atoms[i], self.atoms[j]
             symbols = {first.element, second.element}
             if "H" in symbols or {i, j} & self.ions or (i, j) in self.bonds:
                 continue
             of_one = first.residue_key == second.residue_key
-            is_near = d < self.reach(i, j) + _TOLERANCE_NM
             if of_one:
-                if is_near and {i, j} & free:
+                if d < self.reach(i, j) + _TOLERANCE_NM and {i, j} & free:
                     self.bonds.add((i, j))
             elif {i, j} & linkable and links_residues(first, second, d):
                 self.bonds.add((i, j))
             elif d < _AMIDE_NM and symbols == {"C", "N"} and not {i, j} & free:
                 self.bonds.add((i, j))
                 amides.append((i, j, d))
-            elif is_near and {i, j} & free:
-                apart.append((i, j, d))
         if amides:
             self.notes.append(f"side chains bonded by distance: {listed(self.labels(amides))}")
-        if apart:
-            said = listed(self.labels(apart), 3)
-            self.notes.append(f"near and not bonded, as no CONECT or LINK record says so: {said}")
 
     def add_hydrogens(self, free: set[int]) -> dict[int, str]:
         """Each hydrogen to the nearest heavy atom of its residue, or of all where the residue's names say nothing.

@@ -14,7 +14,7 @@ from systems.chemistry.distance_bonds import bonded_images, images_of_whole
 from systems.chemistry.geometry import extend, near_pairs, signed_volumes
 from systems.errors import PreparationError, listed
 from systems.prepare.bonding import links_residues
-from systems.prepare.records import AtomRecord, Bonding, Residue, ResidueKey, StructureFile, distance_angstrom
+from systems.prepare.records import AtomRecord, Bonding, Residue, StructureFile, distance_angstrom
 from systems.scene import FloatArray, IntArray, neighbours_of
 
 # Lengths in Å and angles in degrees of Engh and Huber, Acta Cryst. A47, 392 (1991).
@@ -35,8 +35,8 @@ def close_gaps(structure: StructureFile, bonding: Bonding, *, cap_breaks: bool, 
     bonded = {i for pair in bonding.peptide_bonds for i in pair}
     gaps = []
     for before, residue in pairwise(bonding.residues):
-        c, n = before.heavy.get("C", -1), residue.heavy.get("N", -1)
-        if min(c, n) < 0 or {c, n} & bonded or before.key[0] != residue.key[0]:
+        ends = {before.heavy.get("C", -1), residue.heavy.get("N", -1)}
+        if ends & {-1, *bonded} or before.key[0] != residue.key[0]:
             continue
         names = [r.template.name for r in (before, residue) if r.template is not None]
         is_end = "OXT" in before.heavy or structure.chain_ends & set(before.atoms)
@@ -125,31 +125,32 @@ _ALPHA = ("CA", "N", "C", "CB")
 _BETA = {"THR": ("CB", "CA", "OG1", "CG2"), "ILE": ("CB", "CA", "CG1", "CG2")}
 _FLAT_NM3 = 2e-4
 
-Handedness = dict[tuple[ResidueKey, str], int]
+# Of a residue by its label, and the centre.
+Handedness = dict[tuple[str, str], int]
 
 
-def handedness(residues: Iterable[tuple[ResidueKey, str, Mapping[str, AtomRecord]]]) -> Handedness:
+def handedness(residues: Iterable[tuple[str, str, Mapping[str, AtomRecord]]]) -> Handedness:
     """Return +1 (natural), -1 (inverted) or 0 (flat) of each stereocentre whose atoms are all there.
 
-    `residues`: (key, standard name, heavy atoms under their standard names). Centres are CA, and CB of THR and ILE.
+    `residues`: (label, standard name, heavy atoms under their standard names). Centres are CA, and CB of THR and ILE.
     """
     found: Handedness = {}
-    for key, name, heavy in residues:
+    for label, name, heavy in residues:
         for row in (_ALPHA, _BETA[name]) if name in _BETA else (_ALPHA,):
             if set(row) <= set(heavy):
                 at = np.array([heavy[a].position_angstrom for a in row]) / 10.0
                 volume = float(signed_volumes(at, [[0, 1, 2, 3]])[0])
-                found[key, row[0]] = 0 if abs(volume) < _FLAT_NM3 else (1 if volume > 0 else -1)
+                found[label, row[0]] = 0 if abs(volume) < _FLAT_NM3 else (1 if volume > 0 else -1)
     return found
 
 
 def refuse_changed(before: Handedness, after: Handedness) -> None:
     """Raise PreparationError when a stereocentre changed, or one that was built anew is not the natural form."""
-    for (key, centre), sign in after.items():
-        expected = before.get((key, centre), 1)
+    for (label, centre), sign in after.items():
+        expected = before.get((label, centre), 1)
         if expected and sign != expected:
             raise PreparationError(
-                f"{_label(key)}: {centre} came out {'inverted' if sign else 'flat'} when atoms were added; "
+                f"{label}: {centre} came out {'inverted' if sign else 'flat'} when atoms were added; "
                 "give the residue with all its heavy atoms."
             )
 
@@ -157,13 +158,9 @@ def refuse_changed(before: Handedness, after: Handedness) -> None:
 def say_inverted(found: Handedness, notes: list[str]) -> None:
     """Note the residues that are not L, or whose side chain is the other diastereomer, as the file has them."""
     for centre, words in (("CA", "D-residues, as the file has them"), ("CB", "the other diastereomer at CB")):
-        names = [_label(key) for (key, atom), sign in found.items() if atom == centre and sign < 0]
+        names = [label for (label, atom), sign in found.items() if atom == centre and sign < 0]
         if names:
             notes.append(f"{words}: {listed(names)}")
-
-
-def _label(key: ResidueKey) -> str:
-    return f"{key[2]} {key[0]}{key[1]}"
 
 
 # ---- molecules made whole by cell vectors ---------------------------------------------------------------------------
@@ -190,17 +187,16 @@ def made_whole(found: StructureFile, notes: list[str]) -> StructureFile:
     images = images_of_whole(x, found.cell_nm, pairs)
     if not images.any():
         return found
-    cut = sorted(np.flatnonzero(images.any(axis=1)).tolist())
-    names = dict.fromkeys(f"{a.residue_name} {a.chain}{a.residue_id}" for a in (atoms[i] for i in cut))
-    note = f"made whole by the periodic cell: moved by cell vectors, {len(cut)} of the atoms of {listed(list(names))}"
     x = x + images @ found.cell_nm
     beside = _beside_the_largest(x, found.cell_nm, pairs)
-    if beside.any():
-        note += f", and other molecules to the nearest image ({int(beside.any(axis=1).sum())} atoms)"
     moved = np.round(10.0 * (x + beside @ found.cell_nm), 6)
-    for i in np.flatnonzero((images + beside).any(axis=1)).tolist():
+    changed = np.flatnonzero((images + beside).any(axis=1)).tolist()
+    for i in changed:
         atoms[i] = replace(atoms[i], position_angstrom=tuple(moved[i].tolist()))
-    notes.append(note)
+    names = dict.fromkeys(f"{atoms[i].residue_name} {atoms[i].chain}{atoms[i].residue_id}" for i in changed)
+    notes.append(
+        f"made whole by the periodic cell: moved by cell vectors, {len(changed)} of the atoms of {listed(list(names))}"
+    )
     return replace(found, atoms=atoms)
 
 

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import math
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
-from itertools import groupby
 
 import networkx as nx
 import numpy as np
@@ -14,7 +12,7 @@ import numpy as np
 from systems.chemistry.residues import is_water_name, template_for
 from systems.errors import PreparationError, listed
 from systems.prepare.bonding import are_ions
-from systems.prepare.records import AtomRecord, Bonding, ResidueKey, by_residue
+from systems.prepare.records import AtomRecord, Bonding, by_residue
 from systems.scene import FloatArray, IntArray
 
 WATER_BOND_ANGSTROM = 1.3
@@ -92,20 +90,11 @@ _AGENTS = {
 
 
 def is_water(atoms: Sequence[AtomRecord]) -> bool:
-    """Whether the atoms of a residue are water: oxygen with two hydrogens within 1.3 Å, whatever it is called.
-
-    Under one of water's names also what is left of waters that are cut or split by a cell: oxygens with two hydrogens
-    each at most, and hydrogens alone.
-    """
-    oxygens = [a.position_angstrom for a in atoms if a.element == "O"]
-    hydrogens = [a.position_angstrom for a in atoms if a.element == "H"]
-    if len(oxygens) + len(hydrogens) < len(atoms):
-        return False
-    if is_water_name(atoms[0].residue_name):
-        return len(hydrogens) <= 2 * max(len(oxygens), 1)
-    return (len(oxygens), len(hydrogens)) == (1, 2) and all(
-        math.dist(oxygens[0], h) < WATER_BOND_ANGSTROM for h in hydrogens
-    )
+    """Whether the atoms of a residue are water, by its name and elements: oxygens with two hydrogens each at most, and
+    what a cell has left of them, hydrogens alone."""
+    oxygens, hydrogens = (sum(a.element == e for a in atoms) for e in "OH")
+    whole = oxygens + hydrogens == len(atoms) and hydrogens <= 2 * max(oxygens, 1)
+    return whole and is_water_name(atoms[0].residue_name)
 
 
 def resolve_solvent(
@@ -116,23 +105,18 @@ def resolve_solvent(
     Left out are waters unless `keep_water`, and free ions unless `keep_ions`: monatomic, no N, O or S of anything else
     within 3 Å. Of a file that holds nothing else, all stays.
     """
-    runs = [list(run) for _, run in groupby(kept, key=lambda i: atoms[i].residue_key)]
-    runs = [run for run in runs if not is_water_name(atoms[run[0]].residue_name)]
-    named: dict[ResidueKey, list[int]] = {}  # all oxygens may stand before all hydrogens
-    for i in kept:
-        if is_water_name(atoms[i].residue_name):
-            named.setdefault(atoms[i].residue_key, []).append(i)
-    runs += named.values()
+    # All oxygens of waters may stand before all hydrogens.
+    runs = [[kept[k] for k in members] for members in by_residue([atoms[i] for i in kept]).values()]
     water = [run for run in runs if is_water([atoms[i] for i in run])]
-    ions = [[i] for run in runs if are_ions([atoms[i] for i in run]) for i in run]
+    ions = [i for run in runs if are_ions([atoms[i] for i in run]) for i in run]
     wet = {i for run in water for i in run}
     cut = {i for run in water if not any(atoms[i].element == "O" for i in run) for i in run}
-    apart = wet | {i for run in ions for i in run}
+    apart = wet.union(ions)
     solute = [i for i in kept if i not in apart]
     if not solute:
         return list(kept), []
     n_waters = sum(atoms[i].element == "O" for i in wet)
-    free = set() if keep_ions else _free(atoms, [run[0] for run in ions], solute)
+    free = set() if keep_ions else _free(atoms, ions, solute)
     count = Counter(atoms[i].residue_name for i in kept if i in free)
     names = listed([f"{n} {name}" if n > 1 else name for name, n in count.items()])
     gone = [

@@ -170,25 +170,9 @@ def _resolved(molecule: Any, notes: list[str]) -> Any:
     Raises PreparationError for what is no molecule, or has atoms on one point.
     """
     require(molecule)
-    try:
-        sanitise(molecule)
-    except PreparationError:
-        _add_charges(molecule, notes)
-        sanitise(molecule)
+    sanitise(molecule)
     drop_isotopes(molecule, notes)
     return _with_geometry(molecule, notes)
-
-
-def _add_charges(molecule: Any, notes: list[str]) -> None:
-    """Give nitrogen of four bonds, oxygen of three and boron of four their charge, where none is written, in place."""
-    changed = []
-    for atom in molecule.GetAtoms():
-        valence = sum(bond.GetBondTypeAsDouble() for bond in atom.GetBonds())
-        charge = {("N", 4): 1, ("O", 3): 1, ("B", 4): -1}.get((atom.GetSymbol(), valence))
-        if charge is not None and not atom.GetFormalCharge():
-            atom.SetFormalCharge(charge)
-            changed.append(f"{atom.GetSymbol()}{atom.GetIdx() + 1} {charge:+d}")
-    notes.append(f"charges that the file leaves out, from the number of bonds: {', '.join(changed)}")
 
 
 def _with_geometry(molecule: Any, notes: list[str]) -> Any:
@@ -432,7 +416,7 @@ def sanitise(molecule: Any) -> None:
         with rdBase.BlockLogs():
             Chem.SanitizeMol(molecule)
     except (Chem.MolSanitizeException, ValueError) as error:
-        raise PreparationError(f"it is no possible molecule ({first_line(error)}).") from error
+        raise PreparationError(f"it is no possible molecule: {first_line(error)} (a charge left out?).") from error
 
 
 def drop_isotopes(molecule: Any, notes: list[str]) -> None:

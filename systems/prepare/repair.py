@@ -7,11 +7,11 @@ from __future__ import annotations
 import contextlib
 import io
 import random
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import lru_cache
 from importlib.resources import files
-from itertools import permutations, product
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -262,6 +262,8 @@ def _keep_hydrogens(
     records: list[AtomRecord], bonds: IntArray, atoms: Sequence[AtomRecord], bonding: Bonding
 ) -> list[AtomRecord]:
     """Put the file's hydrogens back where a heavy atom has as many as before."""
+    from scipy.optimize import linear_sum_assignment
+
     whole = {r.key: r for r in bonding.residues if r.heavy and not r.lacks_hydrogens}
     before, after = bonding.neighbours, neighbours_of(bonds, len(records))
     out = list(records)
@@ -273,11 +275,9 @@ def _keep_hydrogens(
         if not new or len(old) != len(new):
             continue
 
-        def moved(chosen: Iterable[int], new: list[int] = new) -> float:
-            return sum(distance_angstrom(atoms[i], records[j]) ** 2 for i, j in zip(chosen, new, strict=True))
-
-        for a, b in zip(new, min(permutations(old), key=moved), strict=True):
-            out[a] = replace(records[a], position_angstrom=atoms[b].position_angstrom)
+        cost = [[distance_angstrom(records[j], atoms[i]) ** 2 for i in old] for j in new]
+        for a, b in zip(*linear_sum_assignment(cost), strict=True):
+            out[new[a]] = replace(records[new[a]], position_angstrom=atoms[old[b]].position_angstrom)
     return out
 
 

@@ -22,7 +22,6 @@ from systems.prepare.records import (
     Residue,
     StructureFile,
     by_residue,
-    distance_angstrom,
     file_name_and_provenance,
     scene_from_records,
     standardise,
@@ -81,7 +80,7 @@ def _prepared(found: StructureFile, options: Preparation, repairs: list[str]) ->
     repairs += bonding.notes
     atoms, bonds = list(structure.atoms), bonding.bonds
     known = [(r, r.template.name) for r in bonding.residues if r.template is not None]
-    hands = handedness((r.key, name, {a: atoms[i] for a, i in r.heavy.items()}) for r, name in known)
+    hands = handedness((r.label, name, {a: atoms[i] for a, i in r.heavy.items()}) for r, name in known)
     if bonding.is_complete:
         _refuse_bare_skeletons(bonding.residues, atoms)
     else:
@@ -92,7 +91,7 @@ def _prepared(found: StructureFile, options: Preparation, repairs: list[str]) ->
         repairs += summary
         now = by_residue(atoms)
         before = hands
-        hands = handedness((r.key, name, {atoms[i].name: atoms[i] for i in now.get(r.key, ())}) for r, name in known)
+        hands = handedness((r.label, name, {atoms[i].name: atoms[i] for i in now.get(r.key, ())}) for r, name in known)
         refuse_changed(before, hands)
     n_bonds = np.bincount(bonds.ravel(), minlength=len(atoms)).tolist()
     if any(n > _MOST_BONDS.get(a.element, n) for a, n in zip(atoms, n_bonds, strict=True)):
@@ -169,17 +168,12 @@ def _refuse_beyond_repair(bonding: Bonding) -> None:
                 "give the structure with all atoms and hydrogens."
             )
         essential = [a for a in ("N", "CA", "C") if a in residue.template.heavy and a in residue.missing]
-        if essential:
-            raise PreparationError(
-                f"{residue.label} has only {' '.join(residue.heavy)} of its heavy atoms; "
-                "give a structure with at least the whole backbone."
-            )
         built = [a for a in residue.missing if a != "OXT"]
-        if built and template_for(residue.key[2]) is None:
+        if essential or (built and template_for(residue.key[2]) is None):
             instead = ", or leave its phosphate out" if "OP3" in built else ""
             raise PreparationError(
-                f"{residue.label} lacks {' '.join(built)}; atoms are built for standard residues alone: add all its "
-                f"heavy atoms{instead}."
+                f"{residue.label} lacks {' '.join(built)}; atoms are built for standard residues with a whole backbone "
+                f"alone: add all its heavy atoms{instead}."
             )
 
 
@@ -190,19 +184,12 @@ def _refuse_surplus_hydrogens(bonding: Bonding, atoms: Sequence[AtomRecord]) -> 
         for name, i in residue.heavy.items() if template_for(residue.key[2]) is not None else ():
             hydrogens = [atoms[j] for j in neighbours[i] if atoms[j].element == "H"]
             surplus = len(neighbours[i]) - _MOST_BONDS.get(atoms[i].element, len(neighbours[i]))
-            if not hydrogens or surplus <= 0:
-                continue
-            for other in hydrogens:
-                if other.residue_key != residue.key:
-                    raise PreparationError(
-                        f"{other.label} and {atoms[i].label} are {distance_angstrom(other, atoms[i]):.2f} Å apart, and "
-                        "no bond can join them: the atoms clash; model them again, or take all hydrogens out, which "
-                        "are then placed anew."
-                    )
-            raise PreparationError(
-                f"{residue.label} {name} has {len(hydrogens)} hydrogens ({' '.join(h.name for h in hydrogens)}), "
-                f"{surplus} too many; remove what it cannot have, or all hydrogens, which are then placed anew."
-            )
+            if hydrogens and surplus > 0:
+                names = " ".join(h.name if h.residue_key == residue.key else f"and {h.label}" for h in hydrogens)
+                raise PreparationError(
+                    f"{residue.label} {name} has {len(hydrogens)} hydrogens ({names}), {surplus} too many; remove what "
+                    "it cannot have, or all hydrogens, which are then placed anew."
+                )
 
 
 def _refuse_bare_skeletons(residues: Sequence[Residue], atoms: Sequence[AtomRecord]) -> None:

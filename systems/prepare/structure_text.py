@@ -77,7 +77,7 @@ def structure_text(path: Path) -> str:
 def _add_header(structure: Any, found: StructureFile) -> None:
     """Add the cell and the covalent bonds of a `gemmi.Structure`; of alternates, those that go together are bonded.
 
-    Notes say which of the bonds lead to a symmetry copy, and for which the file has no such two atoms.
+    A note says which of the bonds lead to a symmetry copy, or to atoms that the file does not have.
     """
     import gemmi
 
@@ -86,7 +86,7 @@ def _add_header(structure: Any, found: StructureFile) -> None:
     for i, atom in enumerate(found.atoms):
         index.setdefault((*atom.residue_key, atom.name), []).append(i)
     pairs = set(found.conect)
-    elsewhere, absent = [], []
+    unused = []
     for link in structure.connections:
         if link.type not in (gemmi.ConnectionType.Covale, gemmi.ConnectionType.Disulf):
             continue
@@ -97,20 +97,16 @@ def _add_header(structure: Any, found: StructureFile) -> None:
             for j in index.get(ends[1], ())
             if i != j and len({found.atoms[i].altloc, found.atoms[j].altloc} - {""}) < 2
         }
-        name = " - ".join(f"{residue} {chain}{number} {atom}" for chain, number, residue, atom in ends)
-        if link.asu == gemmi.Asu.Different:
-            elsewhere.append(name)
-        elif those:
+        if those and link.asu != gemmi.Asu.Different:
             pairs |= those
         else:
-            absent.append(name)
+            unused.append(" - ".join(f"{residue} {chain}{number} {atom}" for chain, number, residue, atom in ends))
     found.conect = sorted(pairs)
-    for names, reason in (
-        (elsewhere, "they lead to a symmetry copy"),
-        (absent, "the file has no such two atoms together"),
-    ):
-        if names:
-            found.notes.append(f"records of bonds not used, as {reason}: {listed(list(dict.fromkeys(names)))}")
+    if unused:
+        found.notes.append(
+            "records of bonds not used, as they lead to a symmetry copy, or the file has no such two atoms together: "
+            f"{listed(list(dict.fromkeys(unused)))}"
+        )
 
 
 # ---- columns of PDB files -------------------------------------------------------------------------------------------
@@ -190,22 +186,17 @@ def _pdb_atom(line: str, number: int, path: Path) -> AtomRecord:
     residue_name = line[17:21].strip()  # four letters where a program needs them (TIP3), the standard leaves one blank
     hetero = line.startswith("HETATM")
     symbol = element_symbol(name_field, residue_name, line[76:78].strip(), hetero=hetero) or ""
+    number_read = decode(line[22:26], 4)
+    residue_id = (line[22:26].strip() or "1") if number_read is None else str(number_read)
     try:
         occupancy = float(line[54:60])
     except ValueError:
         occupancy = 1.0
     return AtomRecord(
         name_field.strip() or symbol, symbol, residue_name or "UNL", line[21].strip(),
-        _residue_id(line[22:26], line[26:27]), (x, y, z), occupancy=occupancy, altloc=line[16].strip(), hetero=hetero,
+        residue_id + line[26:27].strip(), (x, y, z), occupancy=occupancy, altloc=line[16].strip(), hetero=hetero,
         serial=(line[6:11] if line[5] == " " or hetero else line[5:11]).strip(),
     )  # fmt: skip
-
-
-def _residue_id(number: str, insertion: str) -> str:
-    """`181A`: the number, decimal where the file has it in hybrid-36, and the insertion code."""
-    text = number.strip() or "1"
-    value = decode(number, 4)
-    return (text if value is None or text.lstrip("-").isdigit() else str(value)) + insertion.strip()
 
 
 def decode(field: str, width: int) -> int | None:

@@ -51,7 +51,7 @@ def _write(path: Path, *parts: str) -> str:
     [
         ("O H1 H2", "HOH", "OHH", True),
         ("OW HW1 HW2", "SOL", "OHH", True),
-        ("O1 H1 H2", "LIG", "OHH", True),  # whatever it is called
+        ("O1 H1 H2", "LIG", "OHH", False),
         ("O", "TIP3", "O", True),
         ("O", "XYZ", "O", False),
         ("O H1 H2 H3", "HOH", "OHHH", False),  # hydronium
