@@ -24,7 +24,7 @@ import numpy as np
 import numpy.typing as npt
 
 from systems.chemistry.residues import ONE_LETTER
-from systems.errors import InputError, UnknownNameError, nearest
+from systems.errors import InputError, PreparationError, UnknownNameError, nearest
 from systems.options import Preparation, options_as_keywords
 from systems.scene import PARTICLE, Scene
 
@@ -244,10 +244,8 @@ def names() -> list[str]:
 
 def groups() -> dict[str, list[str]]:
     """Return the names by group, in the catalogue's order; see also `ON_DEMAND`."""
-    found: dict[str, list[str]] = {}
-    for each in ENTRIES.values():
-        found.setdefault(each.group, []).append(each.name)
-    return found
+    each = ENTRIES.values()
+    return {group: [e.name for e in each if e.group == group] for group in dict.fromkeys(e.group for e in each)}
 
 
 def knows(name: str) -> bool:
@@ -303,11 +301,9 @@ def _find(name: str) -> Entry | None:
     """Return the entry of a name, made for names on demand; None when there is no such scene."""
     if name in ENTRIES:
         return ENTRIES[name]
-    if len(name) == 4 and set(name) <= set(ONE_LETTER):
-        return _tetrapeptide(name, "-".join(ONE_LETTER[c] for c in name))
-    if "-" not in name:
+    is_short = len(name) == 4 and set(name) <= set(ONE_LETTER)
+    if not is_short and "-" not in name:
         return None
-    from systems.errors import PreparationError
     from systems.prepare.peptide import parse_sequence
 
     try:
@@ -317,15 +313,15 @@ def _find(name: str) -> Entry | None:
     sequence = "-".join(residues)
     if sequence in ENTRIES:
         return ENTRIES[sequence]
-    if len(residues) == 4 and "ACE" not in residues and "NME" not in residues:
-        return _tetrapeptide(sequence, sequence)
-    title = f"{sequence}, built extended from its sequence"
-    return Entry(sequence, PEPTIDES, title, sequence=sequence)
-
-
-def _tetrapeptide(name: str, sequence: str) -> Entry:
-    title = f"{sequence}, a tetrapeptide with charged ends, built extended from its sequence"
-    return Entry(name, PEPTIDES, title, protocols=("mdgen",), sequence=sequence)
+    is_tetrapeptide = len(residues) == 4 and not {"ACE", "NME"} & set(residues)
+    what = "a tetrapeptide with charged ends, " if is_tetrapeptide else ""
+    return Entry(
+        name if is_short else sequence,
+        PEPTIDES,
+        f"{sequence}, {what}built extended from its sequence",
+        protocols=("mdgen",) if is_tetrapeptide else (),
+        sequence=sequence,
+    )
 
 
 # ---- scenes of all that a user can name -----------------------------------------------------------------------------
@@ -341,8 +337,7 @@ def prepare(spec: str, options: Preparation) -> Scene:
     missing. Waters are left out unless `keep_water` (for explicit solvent; `drop_water` states the default), and with
     them free ions, which no N, O or S of the rest holds, and agents of crystallisation and buffers (glycerol, DMSO,
     sulfate and the like), unless `keep_ligand`. Other ions and ligands beside a peptide are refused until one says what
-    becomes of them; so is a chain that breaks, unless `cap_breaks` closes both ends
-    with the caps NME and ACE.
+    becomes of them; so is a chain that breaks, unless `cap_breaks` closes both ends with the caps NME and ACE.
     Raises UnknownNameError, InputError or PreparationError, each in one line.
     """
     from systems.prepare.mol2_file import is_peptide, read_mol2

@@ -207,8 +207,7 @@ class _Bonds:
             symbols = {first.element, second.element}
             if "H" in symbols or {i, j} & self.ions or (i, j) in self.bonds:
                 continue
-            of_one = first.residue_key == second.residue_key
-            if of_one:
+            if first.residue_key == second.residue_key:
                 if d < self.reach(i, j) + _TOLERANCE_NM and {i, j} & free:
                     self.bonds.add((i, j))
             elif {i, j} & linkable and links_residues(first, second, d):
@@ -224,19 +223,24 @@ class _Bonds:
 
         Returns how far those are that are far from everything: their heavy atoms may be missing.
         """
+        from scipy.spatial import cKDTree
+
         atoms, x = self.atoms, self.x
         bonded = {i for pair in self.bonds for i in pair}
         heavy = np.array([i for i, a in enumerate(atoms) if a.element != "H" and i not in self.ions], dtype=np.int64)
+        tree = cKDTree(x[heavy]) if len(heavy) else None
         strays = {}
         for i, atom in enumerate(atoms):
             if atom.element != "H" or i in bonded:
                 continue
             own = np.array([j for j in self.of_atom[i].atoms if atoms[j].element != "H"], dtype=np.int64)
             parent, distance = -1, np.inf
-            for those in (own if i not in free else heavy[:0], heavy):
-                if distance > _HYDROGEN_NM and len(those):
-                    gaps = np.linalg.norm(x[those] - x[i], axis=1)
-                    parent, distance = int(those[gaps.argmin()]), float(gaps.min())
+            if i not in free and len(own):
+                gaps = np.linalg.norm(x[own] - x[i], axis=1)
+                parent, distance = int(own[gaps.argmin()]), float(gaps.min())
+            if distance > _HYDROGEN_NM and tree is not None:
+                distance, k = tree.query(x[i])
+                parent = int(heavy[k])
             if distance <= _HYDROGEN_NM:
                 self.bonds.add(_pair(i, parent))
             else:

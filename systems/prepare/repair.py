@@ -396,8 +396,6 @@ def protonation_summary(
 # its rotamers (60°, 180°, -60°; every 30° where a planar group turns: the centres of Dunbrack's library, Acta Cryst.
 # D58, 1862 (2002)), and the conformer farthest from all other heavy atoms is taken.
 
-Sites = dict[str, int]
-
 _STAGGERED = (-60.0, 180.0, 60.0)
 _PLANAR = tuple(float(k) for k in range(-180, 180, 30))
 # The atom at the end of the last torsion that turns a planar group.
@@ -421,7 +419,7 @@ def resolve_side_chains(
     positions_nm: FloatArray,
     elements: Sequence[str],
     bonds: Sequence[tuple[int, int]],
-    residues: Sequence[tuple[str, str, Sites, Sequence[str]]],
+    residues: Sequence[tuple[str, str, dict[str, int], Sequence[str]]],
 ) -> list[str]:
     """Build added side chains that overlap again, in place; return a line for each.
 
@@ -451,24 +449,24 @@ def resolve_side_chains(
         joined = [(i, j) for i, j in bonds if i in idx or j in idx]
         ratio = [float(np.linalg.norm(positions_nm[i] - positions_nm[j]) / (radii[i] + radii[j])) for i, j in joined]
         off = any(not 0.75 < r < 1.25 for r in ratio)
-        least, margin = clearance(positions_nm)
-        if not off and margin >= 0:
+        least, margin = (-np.inf, -np.inf) if off else clearance(positions_nm)
+        if margin >= 0:
             continue
-        best = positions_nm.copy() if not off else None
+        best = positions_nm
         for trial in _conformers(name, {a: positions_nm[i] for a, i in sites.items() if a not in moved}, moved):
             x = positions_nm.copy()
             x[idx] = [trial[a] for a in moved]
             of_trial = clearance(x)
-            if best is None or of_trial[1] > margin + 1e-6:
+            if of_trial[1] > margin + 1e-6:
                 best, (least, margin) = x, of_trial
-        if best is None:
+        if off and best is positions_nm:
             continue  # its bonds are refused with their lengths
         if 10.0 * least < _OVERLAP_ANGSTROM:
             raise PreparationError(
                 f"{label}: {' '.join(moved)}, which were missing, come out {10 * least:.2f} Å from another heavy atom "
                 "in every rotamer; give the residue with all its heavy atoms, or make place for it."
             )
-        if not np.array_equal(best, positions_nm):
+        if best is not positions_nm:
             positions_nm[:] = best
             notes.append(f"{label}: {' '.join(moved)} overlapped and were built again in the rotamer with most room")
     return notes
