@@ -24,7 +24,7 @@ import numpy as np
 import numpy.typing as npt
 
 from systems.chemistry.residues import ONE_LETTER
-from systems.errors import InputError, UnknownNameError, nearest
+from systems.errors import InputError, PreparationError, UnknownNameError, nearest
 from systems.options import Preparation, options_as_keywords
 from systems.scene import PARTICLE, Scene
 
@@ -60,30 +60,27 @@ _MDGEN: dict[str, Any] = {
     "hydrogen_mass_da": None,
     "save_every_ps": 0.1,
 }
-PROTOCOLS: dict[str, Protocol] = {
-    protocol.name: protocol
-    for protocol in (
-        Protocol(
-            "md17",
-            _MD17,
-            "MD17, Chmiela et al., Sci. Adv. 3, e1603015 (2017), every tenth frame as in GeoTDM; GAFF2 for their PBE",
-        ),
-        Protocol(
-            "md22",
-            _MD17 | {"force_field": "ff14SB", "timestep_ps": 0.001, "save_every_ps": 0.01},
-            "MD22, Chmiela et al., Sci. Adv. 9, eadf0873 (2023): 500 K, 1 fs; ff14SB in vacuum for their PBE+MBD",
-        ),
-        Protocol(
-            "mdgen",
-            _MDGEN,
-            "MDGen's implicit-solvent runs: Jing, Stärk, Jaakkola and Berger, NeurIPS 2024 (100 ns each)",
-        ),
-        Protocol(
-            "fast-folders",
-            {"force_field": "ff14SB", "solvent": "obc2", "temperature_k": 340.0},
-            "340 K, near chignolin's melting temperature: Lindorff-Larsen et al., Science 334, 517 (2011)",
-        ),
-    )
+PROTOCOLS = {
+    "md17": Protocol(
+        "md17",
+        _MD17,
+        "MD17, Chmiela et al., Sci. Adv. 3, e1603015 (2017), every tenth frame as in GeoTDM; GAFF2 for their PBE",
+    ),
+    "md22": Protocol(
+        "md22",
+        _MD17 | {"force_field": "ff14SB", "timestep_ps": 0.001, "save_every_ps": 0.01},
+        "MD22, Chmiela et al., Sci. Adv. 9, eadf0873 (2023): 500 K, 1 fs; ff14SB in vacuum for their PBE+MBD",
+    ),
+    "mdgen": Protocol(
+        "mdgen",
+        _MDGEN,
+        "MDGen's implicit-solvent runs: Jing, Stärk, Jaakkola and Berger, NeurIPS 2024 (100 ns each)",
+    ),
+    "fast-folders": Protocol(
+        "fast-folders",
+        {"force_field": "ff14SB", "solvent": "obc2", "temperature_k": 340.0},
+        "340 K, near chignolin's melting temperature: Lindorff-Larsen et al., Science 334, 517 (2011)",
+    ),
 }
 
 
@@ -98,37 +95,22 @@ def find_protocol(name: str) -> Protocol:
 # ---- model systems --------------------------------------------------------------------------------------------------
 
 
-_RESIDUE = "PAR"
-
-
 def harmonic_oscillator() -> Scene:
     """Return one particle of 12 Da in a harmonic well, a different force constant along each axis: at 300 K its spread
     is 0.22, 0.16 and 0.11 nm, its period 3.1, 2.2 and 1.5 ps."""
     law = {"kind": "harmonic", "force_constants_kj_mol_nm2": [50.0, 100.0, 200.0]}
-    return _single("harmonic-oscillator", law, [0.1, 0.1, 0.1])
+    return particles("harmonic-oscillator", law, [[0.1, 0.1, 0.1]])
 
 
 def double_well() -> Scene:
     """Return one particle of 12 Da in two wells along x, 6 kJ/mol deep and 0.6 nm apart, the left one lower."""
     law = {"kind": "double-well", "barrier_kj_mol": 6.0, "minimum_nm": 0.3, "tilt_kj_mol_nm": 2.5,
            "transverse_kj_mol_nm2": 200.0}  # fmt: skip
-    return _single("double-well", law, [-0.3, 0.0, 0.0])
+    return particles("double-well", law, [[-0.3, 0.0, 0.0]])
 
 
-def _single(name: str, law: dict[str, Any], position_nm: list[float]) -> Scene:
-    return particles(name, law, [position_nm], masses_da=np.array([12.0]),
-                     provenance={"source": "library", "library_name": name, "repairs": []})  # fmt: skip
-
-
-def particles(
-    name: str,
-    law: dict[str, Any],
-    positions_nm: npt.ArrayLike,
-    *,
-    masses_da: npt.ArrayLike,
-    provenance: dict[str, Any] | None = None,
-) -> Scene:
-    """Return a scene of particles at `(n, 3)` nm with masses `(n,)` Da under `law` (see the module).
+def particles(name: str, law: dict[str, Any], positions_nm: npt.ArrayLike) -> Scene:
+    """Return a scene of particles of 12 Da at `(n, 3)` nm under `law` (see the module).
 
     Raises InputError when the law is unknown or incomplete.
     """
@@ -140,36 +122,31 @@ def particles(
         atom_names=tuple(f"P{k + 1}" for k in range(n)),
         elements=(PARTICLE,) * n,
         residue_of_atom=np.zeros(n, dtype=np.int64),
-        residue_names=(_RESIDUE,),
+        residue_names=("PAR",),
         residue_ids=("1",),
         chain_of_residue=("A",),
         bonds=np.zeros((0, 2), dtype=np.int64),
         bond_orders=np.zeros(0),
         formal_charges=np.zeros(n, dtype=np.int64),
-        masses_da=np.array(masses_da, dtype=np.float64),
+        masses_da=np.full(n, 12.0),
         positions_nm=positions,
-        provenance=dict(provenance or {}),
+        provenance={},
         interactions=law,
     )
 
 
-_ENTRIES = {
-    "harmonic": {"force_constants_kj_mol_nm2"},
-    "double-well": {"barrier_kj_mol", "minimum_nm", "tilt_kj_mol_nm", "transverse_kj_mol_nm2"},
+_LAWS = {
+    "harmonic": {"kind", "force_constants_kj_mol_nm2"},
+    "double-well": {"kind", "barrier_kj_mol", "minimum_nm", "tilt_kj_mol_nm", "transverse_kj_mol_nm2"},
 }
 
 
 def check_law(law: dict[str, Any]) -> None:
     """Raise InputError unless `law` is known and complete."""
-    kind = law.get("kind")
-    if kind not in _ENTRIES:
-        raise InputError(f"a model system of kind {kind!r} is unknown; known: {', '.join(_ENTRIES)}.")
-    found = set(law) - {"kind"}
-    if found != _ENTRIES[kind]:
-        wrong = ", ".join(sorted(found ^ _ENTRIES[kind]))
-        raise InputError(f"the law of kind {kind!r} needs {', '.join(sorted(_ENTRIES[kind]))}; see: {wrong}.")
-    if kind == "harmonic" and len(law["force_constants_kj_mol_nm2"]) != 3:
-        raise InputError("a harmonic well needs three force constants, for x, y and z.")
+    constants = law.get("force_constants_kj_mol_nm2", (0, 0, 0))
+    if _LAWS.get(law.get("kind", "")) != set(law) or not isinstance(constants, list | tuple) or len(constants) != 3:
+        known = "; ".join(f"{kind}: {', '.join(sorted(entries - {'kind'}))}" for kind, entries in _LAWS.items())
+        raise InputError(f"the law {law} of a model system is none of {known} (three force constants, for x, y and z).")
 
 
 # ---- contents of the library ----------------------------------------------------------------------------------------
@@ -267,10 +244,8 @@ def names() -> list[str]:
 
 def groups() -> dict[str, list[str]]:
     """Return the names by group, in the catalogue's order; see also `ON_DEMAND`."""
-    found: dict[str, list[str]] = {}
-    for each in ENTRIES.values():
-        found.setdefault(each.group, []).append(each.name)
-    return found
+    each = ENTRIES.values()
+    return {group: [e.name for e in each if e.group == group] for group in dict.fromkeys(e.group for e in each)}
 
 
 def knows(name: str) -> bool:
@@ -297,7 +272,8 @@ def load(name: str) -> Scene:
     found = entry(name)
     provenance: dict[str, Any] = {"source": "library", "library_name": found.name, "repairs": []}
     if found.group == ANALYTIC:
-        return {"harmonic-oscillator": harmonic_oscillator, "double-well": double_well}[found.name]()
+        model = {"harmonic-oscillator": harmonic_oscillator, "double-well": double_well}[found.name]()
+        return replace(model, provenance=provenance)
     if found.name in ENTRIES:
         return replace(_shipped(found.file or found.name), name=found.name, provenance=provenance)
     scene = _built_peptide(found.sequence)
@@ -325,11 +301,9 @@ def _find(name: str) -> Entry | None:
     """Return the entry of a name, made for names on demand; None when there is no such scene."""
     if name in ENTRIES:
         return ENTRIES[name]
-    if len(name) == 4 and set(name) <= set(ONE_LETTER):
-        return _tetrapeptide(name, "-".join(ONE_LETTER[c] for c in name))
-    if "-" not in name:
+    is_short = len(name) == 4 and set(name) <= set(ONE_LETTER)
+    if not is_short and "-" not in name:
         return None
-    from systems.errors import PreparationError
     from systems.prepare.peptide import parse_sequence
 
     try:
@@ -339,22 +313,18 @@ def _find(name: str) -> Entry | None:
     sequence = "-".join(residues)
     if sequence in ENTRIES:
         return ENTRIES[sequence]
-    if len(residues) == 4 and "ACE" not in residues and "NME" not in residues:
-        return _tetrapeptide(sequence, sequence)
-    title = f"{sequence}, built extended from its sequence"
-    return Entry(sequence, PEPTIDES, title, sequence=sequence)
-
-
-def _tetrapeptide(name: str, sequence: str) -> Entry:
-    title = f"{sequence}, a tetrapeptide with charged ends, built extended from its sequence"
-    return Entry(name, PEPTIDES, title, protocols=("mdgen",), sequence=sequence)
+    is_tetrapeptide = len(residues) == 4 and not {"ACE", "NME"} & set(residues)
+    what = "a tetrapeptide with charged ends, " if is_tetrapeptide else ""
+    return Entry(
+        name if is_short else sequence,
+        PEPTIDES,
+        f"{sequence}, {what}built extended from its sequence",
+        protocols=("mdgen",) if is_tetrapeptide else (),
+        sequence=sequence,
+    )
 
 
 # ---- scenes of all that a user can name -----------------------------------------------------------------------------
-
-
-_FILE_SUFFIXES = (".pdb", ".ent", ".cif", ".mmcif", ".gz")
-_OTHER_SUFFIXES = (".xyz", ".gro", ".pdbqt", ".prmtop", ".psf", ".h5", ".dcd", ".xtc")
 
 
 @options_as_keywords(Preparation)
@@ -367,12 +337,12 @@ def prepare(spec: str, options: Preparation) -> Scene:
     missing. Waters are left out unless `keep_water` (for explicit solvent; `drop_water` states the default), and with
     them free ions, which no N, O or S of the rest holds, and agents of crystallisation and buffers (glycerol, DMSO,
     sulfate and the like), unless `keep_ligand`. Other ions and ligands beside a peptide are refused until one says what
-    becomes of them; so is a chain that breaks, unless `cap_breaks` closes both ends
-    with the caps NME and ACE.
+    becomes of them; so is a chain that breaks, unless `cap_breaks` closes both ends with the caps NME and ACE.
     Raises UnknownNameError, InputError or PreparationError, each in one line.
     """
-    from systems.prepare.mol2_file import is_peptide_mol2
-    from systems.prepare.molecule import SUFFIXES
+    from systems.prepare.mol2_file import is_peptide, read_mol2
+    from systems.prepare.molecule import SUFFIXES, scene_from_mol_file, scene_from_smiles
+    from systems.prepare.peptide import build_peptide
     from systems.prepare.records import suffix_of
     from systems.prepare.structure_file import prepare_file
 
@@ -380,23 +350,15 @@ def prepare(spec: str, options: Preparation) -> Scene:
     text = str(spec).strip()
     kind, _, rest = text.partition(":")
     if kind.lower() == "sequence":
-        from systems.prepare.peptide import build_peptide
-
         return build_peptide(rest, ph=options.ph)
     if kind.lower() == "smiles":
-        from systems.prepare.molecule import scene_from_smiles
-
         return scene_from_smiles(rest)
     path = Path(text).expanduser()
     if text in names():
         return load(text)
     suffix = suffix_of(path)
-    if suffix in SUFFIXES and not (suffix == ".mol2" and is_peptide_mol2(path)):
-        from systems.prepare.molecule import scene_from_mol_file
-
+    if suffix in SUFFIXES and not (suffix == ".mol2" and is_peptide(read_mol2(path))):
         return scene_from_mol_file(path)
-    if suffix in _OTHER_SUFFIXES:
-        raise InputError(f"{path}: {suffix} files are not read as scenes; convert it to PDB, mmCIF or SDF.")
-    if suffix in (*_FILE_SUFFIXES, ".mol2") or path.exists() or "/" in text:
+    if suffix or path.exists() or "/" in text:
         return prepare_file(path, options)
     return load(text)

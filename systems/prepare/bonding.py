@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Collection, Mapping, Sequence
-from typing import Any
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -37,17 +36,14 @@ _COINCIDENT_NM = 0.03
 _CONECT_SLACK_NM = 0.1
 
 
-def find_bonds(
-    atoms: Sequence[AtomRecord], conect: Sequence[tuple[int, int]], chain_ends: Collection[int] = ()
-) -> Bonding:
+def find_bonds(atoms: Sequence[AtomRecord], conect: Sequence[tuple[int, int]]) -> Bonding:
     """Return the bonds of these atoms.
 
     Standard residues take heavy-atom bonds from their template, hydrogens go to the nearest heavy atom, peptide and
     disulfide bonds are found by distance. All other residues take CONECT records if these reach each of their atoms,
     distances within 0.04 nm of the sum of covalent radii if not; to other residues only the bonds that link polymers.
-    Monatomic ions have no bonds by distance, and metal ions none at all. Peptide bonds across one of the `chain_ends`
-    (atoms that TER follows) are noted. Raises PreparationError for atoms that coincide, bonds of templates that are too
-    long to be any, and hydrogens far from everything.
+    Monatomic ions have no bonds by distance, and metal ions none at all. Raises PreparationError for atoms that
+    coincide, bonds of templates that are too long to be any, and hydrogens far from everything.
     """
     found = _Bonds(atoms)
     x, of_atom = found.x, found.of_atom
@@ -61,25 +57,22 @@ def find_bonds(
     metals = {i for i in found.ions if is_metal(atoms[i].element)}
     found.add_conect(conect, metals)
     free = found.free_atoms()
-    across = [
-        f"{of_atom[c].label} - {of_atom[n].label}"
-        for c, n in sorted(peptide)
-        if any(min(c, n) <= end < max(c, n) for end in chain_ends if of_atom.get(end) in (of_atom[c], of_atom[n]))
-    ]
-    if across:
-        found.notes.append(f"peptide bonds across the end of a chain (TER): {listed(across)}")
     found.add_by_distance(free)
     strays = found.add_hydrogens(free)
     found.add_disulfides()
-    found.add_links_of_components()
     bonds = np.array(sorted(found.bonds), dtype=np.int64).reshape(-1, 2)
     _note_missing(found.residues, atoms, bonds)
-    for i, error in strays.items():
+    for i, away in strays.items():
         if not of_atom[i].missing:
-            raise error
+            raise PreparationError(f"Hydrogen {atoms[i].label} is {away}; correct or remove it.")
     if strays:
         gone = listed([atoms[i].label for i in strays])
         found.notes.append(f"hydrogens left out whose atoms are missing: {gone}")
+    found.notes += [
+        f"disulfide bond {of_atom[i].label} - {of_atom[j].label} ({10 * float(np.linalg.norm(x[i] - x[j])):.2f} Å)"
+        for i, j in bonds.tolist()
+        if all(of_atom[k].heavy.get("SG") == k for k in (i, j))
+    ]
     lost = [(i, j) for i, j in conect if _pair(i, j) not in found.bonds and not {i, j} & metals]
     unmade = found.labels([(i, j, float(np.linalg.norm(x[i] - x[j]))) for i, j in lost])
     return Bonding(bonds, found.residues, found.notes, peptide, unmade)
@@ -205,80 +198,59 @@ class _Bonds:
         return free
 
     def add_by_distance(self, free: set[int]) -> None:
-        """Bonds of the free atoms: within a residue whatever is near enough, to other residues what links polymers; and
-        amides of side chains."""
-        found, apart, amides = set(), [], []
+        """Bonds of the free atoms: within a residue whatever is near enough, to other residues what links polymers.
+        Besides, amides of side chains, and the links of residues that are components of the dictionary."""
+        linkable = free | {i for r in self.residues if r.heavy and template_for(r.key[2]) is None for i in r.atoms}
+        amides = []
         for i, j, d in self.near:
             first, second = self.atoms[i], self.atoms[j]
-            is_known, symbols = (i, j) in self.bonds, {first.element, second.element}
-            of_one = first.residue_key == second.residue_key
-            if d < _AMIDE_NM and not {i, j} & free and not is_known and not of_one and symbols == {"C", "N"}:
-                found.add((i, j))
+            symbols = {first.element, second.element}
+            if "H" in symbols or {i, j} & self.ions or (i, j) in self.bonds:
+                continue
+            if first.residue_key == second.residue_key:
+                if d < self.reach(i, j) + _TOLERANCE_NM and {i, j} & free:
+                    self.bonds.add((i, j))
+            elif {i, j} & linkable and links_residues(first, second, d):
+                self.bonds.add((i, j))
+            elif d < _AMIDE_NM and symbols == {"C", "N"} and not {i, j} & free:
+                self.bonds.add((i, j))
                 amides.append((i, j, d))
-            if {i, j} & free and not {i, j} & self.ions and "H" not in symbols:
-                if d >= self.reach(i, j) + _TOLERANCE_NM:
-                    continue
-                if of_one or links_residues(first, second, d):
-                    found.add((i, j))
-                elif not is_known:
-                    apart.append((i, j, d))
-        self.bonds |= found
         if amides:
             self.notes.append(f"side chains bonded by distance: {listed(self.labels(amides))}")
-        if apart:
-            said = listed(self.labels(apart), 3)
-            self.notes.append(f"near and not bonded, as no CONECT or LINK record says so: {said}")
 
-    def add_hydrogens(self, free: set[int]) -> dict[int, PreparationError]:
+    def add_hydrogens(self, free: set[int]) -> dict[int, str]:
         """Each hydrogen to the nearest heavy atom of its residue, or of all where the residue's names say nothing.
 
-        Returns what is wrong with those of standard residues that are far from everything: their heavy atoms may be
-        missing.
+        Returns how far those are that are far from everything: their heavy atoms may be missing.
         """
+        from scipy.spatial import cKDTree
+
         atoms, x = self.atoms, self.x
         bonded = {i for pair in self.bonds for i in pair}
         heavy = np.array([i for i, a in enumerate(atoms) if a.element != "H" and i not in self.ions], dtype=np.int64)
-        tree: Any = None
+        tree = cKDTree(x[heavy]) if len(heavy) else None
         strays = {}
         for i, atom in enumerate(atoms):
             if atom.element != "H" or i in bonded:
                 continue
-            residue = self.of_atom[i]
-            own = np.array([j for j in residue.atoms if atoms[j].element != "H"], dtype=np.int64)
+            own = np.array([j for j in self.of_atom[i].atoms if atoms[j].element != "H"], dtype=np.int64)
             parent, distance = -1, np.inf
             if i not in free and len(own):
                 gaps = np.linalg.norm(x[own] - x[i], axis=1)
                 parent, distance = int(own[gaps.argmin()]), float(gaps.min())
-            if distance > _HYDROGEN_NM and len(heavy):
-                if tree is None:  # few structures need it, and it is slow to import
-                    from scipy.spatial import cKDTree
-
-                    tree = cKDTree(x[heavy])
-                gap, k = tree.query(x[i])
-                parent, distance = int(heavy[k]), float(gap)
+            if distance > _HYDROGEN_NM and tree is not None:
+                distance, k = tree.query(x[i])
+                parent = int(heavy[k])
             if distance <= _HYDROGEN_NM:
                 self.bonds.add(_pair(i, parent))
-                continue
-            nearest = f"{distance * 10:.2f} Å from the nearest heavy atom" if parent >= 0 else "alone"
-            strays[i] = PreparationError(f"Hydrogen {atom.label} is {nearest}; correct or remove it.")
-            if not residue.heavy or template_for(residue.key[2]) is None:
-                raise strays[i]
+            else:
+                strays[i] = f"{distance * 10:.2f} Å from the nearest heavy atom" if parent >= 0 else "alone"
         return strays
 
     def add_disulfides(self) -> None:
         degree = Counter(i for pair in self.bonds for i in pair)
         for i, j, d in self.near:
             if d < _DISULFIDE_NM and all(self.of_atom[k].heavy.get("SG") == k and degree[k] == 1 for k in (i, j)):
-                self.bonds.add((i, j))
-
-    def add_links_of_components(self) -> None:
-        """Bonds that link polymers, between two residues of which one is a component of the dictionary."""
-        of_component = {i for r in self.residues if r.heavy and template_for(r.key[2]) is None for i in r.atoms}
-        for i, j, d in self.near:
-            if not {i, j} & of_component or {i, j} & self.ions or self.of_atom[i] is self.of_atom[j]:
-                continue
-            first, second = self.atoms[i], self.atoms[j]
-            if "H" not in (first.element, second.element) and links_residues(first, second, d):
                 self.bonds.add((i, j))
 
 

@@ -14,7 +14,7 @@ from systems.chemistry.distance_bonds import bonded_images, images_of_whole
 from systems.chemistry.geometry import extend, near_pairs, signed_volumes
 from systems.errors import PreparationError, listed
 from systems.prepare.bonding import links_residues
-from systems.prepare.records import AtomRecord, Bonding, Residue, ResidueKey, StructureFile, distance_angstrom
+from systems.prepare.records import AtomRecord, Bonding, Residue, StructureFile, distance_angstrom
 from systems.scene import FloatArray, IntArray, neighbours_of
 
 # Lengths in Å and angles in degrees of Engh and Huber, Acta Cryst. A47, 392 (1991).
@@ -24,53 +24,46 @@ _NH_ANGSTROM = 1.3
 _PHI = (-65.0, -85.0, -110.0, -135.0, -160.0, 180.0, 60.0, 90.0, 120.0, 150.0)
 
 
-def find_gaps(bonding: Bonding, chain_ends: set[int]) -> list[tuple[Residue, Residue]]:
-    """Return neighbours in one chain, neither an end by its atoms, a cap or TER, whose C and N no bond joins."""
-    bonded_n = {i for pair in bonding.peptide_bonds for i in pair}
-    found = []
-    for before, residue in pairwise(bonding.residues):
-        c, n = before.heavy.get("C", -1), residue.heavy.get("N", -1)
-        if min(c, n) < 0 or {c, n} & bonded_n or before.key[0] != residue.key[0] or chain_ends & set(before.atoms):
-            continue
-        names = (before.template.name if before.template else "", residue.template.name if residue.template else "")
-        if all(names) and names[0] not in ("NME", "NH2") and names[1] != "ACE" and "OXT" not in before.heavy:
-            found.append((before, residue))
-    return found
+def close_gaps(structure: StructureFile, bonding: Bonding, *, cap_breaks: bool, notes: list[str]) -> list[AtomRecord]:
+    """Return the heavy atoms of an NME before and an ACE after each break of a chain, trans, clear of the other atoms.
 
-
-def refuse_gaps(gaps: Sequence[tuple[Residue, Residue]], atoms: Sequence[AtomRecord]) -> None:
-    """Raise PreparationError where a chain breaks."""
-    for before, residue in gaps:
-        gap = np.linalg.norm(_at(atoms, before, "C") - _at(atoms, residue, "N"))
-        more = f", and in {len(gaps) - 1} more places" if len(gaps) > 1 else ""
-        raise PreparationError(
-            f"the chain breaks between {before.label} and {residue.label} (C and N are {gap:.1f} Å apart){more}; fill "
-            "the gap, add `cap_breaks=True` to close both ends with caps, or end the chain there with a TER record."
-        )
-
-
-def caps_of(gaps: Sequence[tuple[Residue, Residue]], atoms: Sequence[AtomRecord], notes: list[str]) -> list[AtomRecord]:
-    """Return the heavy atoms of an NME before and an ACE after each gap, trans, clear of the other atoms.
-
-    Raises PreparationError where an end has not the atoms that a cap is built from.
+    A chain breaks where no bond joins C and N of neighbours in it, neither an end by its atoms, a cap or TER.
+    Raises PreparationError where a chain breaks and `cap_breaks` is not asked for, or where an end has not the atoms
+    that a cap is built from.
     """
+    atoms = structure.atoms
+    bonded = {i for pair in bonding.peptide_bonds for i in pair}
+    gaps = []
+    for before, residue in pairwise(bonding.residues):
+        ends = {before.heavy.get("C", -1), residue.heavy.get("N", -1)}
+        if ends & {-1, *bonded} or before.key[0] != residue.key[0]:
+            continue
+        names = [r.template.name for r in (before, residue) if r.template is not None]
+        is_end = "OXT" in before.heavy or structure.chain_ends & set(before.atoms)
+        if len(names) == 2 and names[0] not in ("NME", "NH2") and names[1] != "ACE" and not is_end:
+            gaps.append((before, residue))
     caps: list[AtomRecord] = []
     for before, residue in gaps:
-        for end, needed in ((before, ("CA", "C", "O")), (residue, ("N", "CA", "C"))):
-            lacking = [a for a in needed if a not in end.heavy]
-            if lacking:
-                raise PreparationError(f"{end.label} lacks {' '.join(lacking)}, from which its cap would be built.")
+        if not cap_breaks:
+            gap = np.linalg.norm(_at(atoms, before, "C") - _at(atoms, residue, "N"))
+            more = f", and in {len(gaps) - 1} more places" if len(gaps) > 1 else ""
+            raise PreparationError(
+                f"the chain breaks between {before.label} and {residue.label} (C and N are {gap:.1f} Å apart){more}; "
+                "fill the gap, add `cap_breaks=True` to close both ends with caps, or end the chain there with a TER "
+                "record."
+            )
+        if not {"CA", "C", "O"} <= set(before.heavy) or not {"N", "CA", "C"} <= set(residue.heavy):
+            raise PreparationError(
+                f"{before.label} or {residue.label} lacks backbone atoms, which a cap is built from."
+            )
         ca, c, o = (_at(atoms, before, a) for a in ("CA", "C", "O"))
         n = c + _C_N * _between(c, ca, o)
         caps += _records("NME", _beside(before, 1), {"N": n, "C": extend(ca, c, n, _N_CH3, _C_N_CA, 180.0)})
-        others = np.array([a.position_angstrom for a in (*atoms, *caps) if a.element != "H"])
-        acetyls = _acetyls(atoms, residue)
         n = _at(atoms, residue, "N")
+        others = np.array([a.position_angstrom for a in (*atoms, *caps) if a.element != "H"])
         others = others[np.linalg.norm(others - n, axis=1) > 2.0]  # CA and what else is bonded to the nitrogen
-        clear = [
-            min(float(np.linalg.norm(others - place, axis=1).min(initial=np.inf)) for place in each.values())
-            for each in acetyls
-        ]
+        acetyls = _acetyls(atoms, residue)
+        clear = [np.linalg.norm(others - np.array(list(each.values()))[:, None], axis=2).min() for each in acetyls]
         caps += _records("ACE", _beside(residue, -1), acetyls[int(np.argmax(clear))])
     if gaps:
         notes.append(f"caps added where the chain breaks: {listed([f'{a.label} | {b.label}' for a, b in gaps])}")
@@ -132,31 +125,32 @@ _ALPHA = ("CA", "N", "C", "CB")
 _BETA = {"THR": ("CB", "CA", "OG1", "CG2"), "ILE": ("CB", "CA", "CG1", "CG2")}
 _FLAT_NM3 = 2e-4
 
-Handedness = dict[tuple[ResidueKey, str], int]
+# Of a residue by its label, and the centre.
+Handedness = dict[tuple[str, str], int]
 
 
-def handedness(residues: Iterable[tuple[ResidueKey, str, Mapping[str, AtomRecord]]]) -> Handedness:
+def handedness(residues: Iterable[tuple[str, str, Mapping[str, AtomRecord]]]) -> Handedness:
     """Return +1 (natural), -1 (inverted) or 0 (flat) of each stereocentre whose atoms are all there.
 
-    `residues`: (key, standard name, heavy atoms under their standard names). Centres are CA, and CB of THR and ILE.
+    `residues`: (label, standard name, heavy atoms under their standard names). Centres are CA, and CB of THR and ILE.
     """
     found: Handedness = {}
-    for key, name, heavy in residues:
+    for label, name, heavy in residues:
         for row in (_ALPHA, _BETA[name]) if name in _BETA else (_ALPHA,):
             if set(row) <= set(heavy):
                 at = np.array([heavy[a].position_angstrom for a in row]) / 10.0
                 volume = float(signed_volumes(at, [[0, 1, 2, 3]])[0])
-                found[key, row[0]] = 0 if abs(volume) < _FLAT_NM3 else (1 if volume > 0 else -1)
+                found[label, row[0]] = 0 if abs(volume) < _FLAT_NM3 else (1 if volume > 0 else -1)
     return found
 
 
 def refuse_changed(before: Handedness, after: Handedness) -> None:
     """Raise PreparationError when a stereocentre changed, or one that was built anew is not the natural form."""
-    for (key, centre), sign in after.items():
-        expected = before.get((key, centre), 1)
+    for (label, centre), sign in after.items():
+        expected = before.get((label, centre), 1)
         if expected and sign != expected:
             raise PreparationError(
-                f"{_label(key)}: {centre} came out {'inverted' if sign else 'flat'} when atoms were added; "
+                f"{label}: {centre} came out {'inverted' if sign else 'flat'} when atoms were added; "
                 "give the residue with all its heavy atoms."
             )
 
@@ -164,23 +158,16 @@ def refuse_changed(before: Handedness, after: Handedness) -> None:
 def say_inverted(found: Handedness, notes: list[str]) -> None:
     """Note the residues that are not L, or whose side chain is the other diastereomer, as the file has them."""
     for centre, words in (("CA", "D-residues, as the file has them"), ("CB", "the other diastereomer at CB")):
-        names = [_label(key) for (key, atom), sign in found.items() if atom == centre and sign < 0]
+        names = [label for (label, atom), sign in found.items() if atom == centre and sign < 0]
         if names:
             notes.append(f"{words}: {listed(names)}")
-    flat = [f"{_label(key)} {atom}" for (key, atom), sign in found.items() if sign == 0]
-    if flat:
-        notes.append(f"flat stereocentres, as the file has them: {listed(flat)}")
-
-
-def _label(key: ResidueKey) -> str:
-    return f"{key[2]} {key[0]}{key[1]}"
 
 
 # ---- molecules made whole by cell vectors ---------------------------------------------------------------------------
 
 
-def made_whole(found: StructureFile) -> StructureFile:
-    """Return the structure with every molecule that its cell cuts in one piece, and a note of it; else as it is.
+def made_whole(found: StructureFile, notes: list[str]) -> StructureFile:
+    """Return the structure with every molecule that its cell cuts in one piece, with a note; else as it is.
 
     Atoms of one residue are bonded where an image of one is within a bond's length of the other; those of two residues
     where a record says so, or where it is one of the bonds that link polymers. What stands beside a molecule that was
@@ -189,38 +176,28 @@ def made_whole(found: StructureFile) -> StructureFile:
     if found.cell_nm is None or len(found.atoms) < 2:
         return found
     x = np.array([a.position_angstrom for a in found.atoms]) / 10.0
-    pairs = _bonds_in_cell(found, x)
+    atoms, stated = list(found.atoms), set(found.conect)
+    near, lengths = bonded_images([a.element for a in atoms], x, found.cell_nm)
+    rows = [
+        (i, j)
+        for (i, j), d in zip(near.tolist(), lengths.tolist(), strict=True)
+        if atoms[i].residue_key == atoms[j].residue_key or (i, j) in stated or links_residues(atoms[i], atoms[j], d)
+    ]
+    pairs = np.array(rows, dtype=np.int64).reshape(-1, 2)
     images = images_of_whole(x, found.cell_nm, pairs)
     if not images.any():
         return found
-    cut = sorted(np.flatnonzero(images.any(axis=1)).tolist())
-    names = dict.fromkeys(f"{a.residue_name} {a.chain}{a.residue_id}" for a in (found.atoms[i] for i in cut))
-    note = f"made whole by the periodic cell: moved by cell vectors, {len(cut)} of the atoms of {listed(list(names))}"
     x = x + images @ found.cell_nm
     beside = _beside_the_largest(x, found.cell_nm, pairs)
-    if beside.any():
-        note += f", and other molecules to the nearest image ({int(beside.any(axis=1).sum())} atoms)"
-    moved = np.round(10.0 * (x + beside @ found.cell_nm), 6).tolist()
-    changed: list[bool] = np.any(images + beside, axis=1).tolist()
-    atoms = [
-        replace(atom, position_angstrom=(px, py, pz)) if change else atom
-        for atom, (px, py, pz), change in zip(found.atoms, moved, changed, strict=True)
-    ]
-    return replace(found, atoms=atoms, notes=[*found.notes, note])
-
-
-def _bonds_in_cell(found: StructureFile, x: FloatArray) -> IntArray:
-    """What is bonded, `(n, 2)`, images being alike."""
-    assert found.cell_nm is not None
-    atoms = found.atoms
-    stated = set(found.conect)
-    pairs, length = bonded_images([a.element for a in atoms], x, found.cell_nm)
-    rows = [
-        (i, j)
-        for (i, j), d in zip(pairs.tolist(), length.tolist(), strict=True)
-        if atoms[i].residue_key == atoms[j].residue_key or (i, j) in stated or links_residues(atoms[i], atoms[j], d)
-    ]
-    return np.array(rows, dtype=np.int64).reshape(-1, 2)
+    moved = np.round(10.0 * (x + beside @ found.cell_nm), 6)
+    changed = np.flatnonzero((images + beside).any(axis=1)).tolist()
+    for i in changed:
+        atoms[i] = replace(atoms[i], position_angstrom=tuple(moved[i].tolist()))
+    names = dict.fromkeys(f"{atoms[i].residue_name} {atoms[i].chain}{atoms[i].residue_id}" for i in changed)
+    notes.append(
+        f"made whole by the periodic cell: moved by cell vectors, {len(changed)} of the atoms of {listed(list(names))}"
+    )
+    return replace(found, atoms=atoms)
 
 
 def _beside_the_largest(x: FloatArray, cell_nm: FloatArray, pairs: IntArray) -> IntArray:

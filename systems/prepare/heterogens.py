@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import math
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
-from itertools import groupby
 
 import networkx as nx
 import numpy as np
@@ -14,7 +12,7 @@ import numpy as np
 from systems.chemistry.residues import is_water_name, template_for
 from systems.errors import PreparationError, listed
 from systems.prepare.bonding import are_ions
-from systems.prepare.records import AtomRecord, Bonding, ResidueKey, by_residue
+from systems.prepare.records import AtomRecord, Bonding, by_residue
 from systems.scene import FloatArray, IntArray
 
 WATER_BOND_ANGSTROM = 1.3
@@ -56,9 +54,7 @@ def complete_waters(
         ]
         around = np.concatenate([around, pair])
     n = len(oxygens)
-    notes.append(
-        f"{n} water molecule{'s' if n > 1 else ''} kept" + (f", hydrogens placed on {len(bare)}" if bare else "")
-    )
+    notes.append(f"{_counted(n, 'water molecule')} kept" + (f", hydrogens placed on {len(bare)}" if bare else ""))
     records = [a for oxygen, hydrogens in zip(oxygens, own, strict=True) for a in (oxygen, *hydrogens)]
     first = 3 * np.arange(n)
     bonds = np.stack([np.stack([first, first + k], axis=1) for k in (1, 2)], axis=1).reshape(-1, 2)
@@ -82,8 +78,6 @@ def _freest(oxygen: FloatArray, near: FloatArray, rng: np.random.Generator) -> F
 
 
 _BOUND_ANGSTROM = 3.0
-# Nearer than waters come to each other, farther than a bond between oxygens.
-_PEROXIDE_ANGSTROM = 1.8
 # What crystals are grown from and frozen in, and what peptides are delivered as salts of: component and heavy atoms.
 _AGENTS = {
     "1PE": "C10O6", "ACN": "C3O", "ACT": "C2O2", "ACY": "C2O2", "AZI": "N3", "BCT": "CO3", "BME": "C2OS",
@@ -96,29 +90,11 @@ _AGENTS = {
 
 
 def is_water(atoms: Sequence[AtomRecord]) -> bool:
-    """Whether the atoms of a residue are one or more waters: told by elements and distances, never by name alone.
-
-    Each oxygen has two hydrogens of its own within 1.3 Å. Under one of water's names also what is left of waters that
-    are cut or split by a cell: oxygens apart from each other with two hydrogens each at most, and hydrogens alone.
-    """
-    oxygens = [a.position_angstrom for a in atoms if a.element == "O"]
-    hydrogens = [a.position_angstrom for a in atoms if a.element == "H"]
-    if len(oxygens) + len(hydrogens) < len(atoms):
-        return False
-    if is_water_name(atoms[0].residue_name):
-        if len(oxygens) < 2 or len(hydrogens) > 2 * len(oxygens):  # of a box of water, each has one
-            return not oxygens or len(hydrogens) <= 2
-        from scipy.spatial import cKDTree
-
-        return not cKDTree(oxygens).query_pairs(_PEROXIDE_ANGSTROM)
-    if len(hydrogens) < 2 * len(oxygens) or not oxygens:
-        return False
-    if len(oxygens) == 1:
-        return len(hydrogens) == 2 and all(math.dist(oxygens[0], h) < WATER_BOND_ANGSTROM for h in hydrogens)
-    from scipy.spatial import cKDTree
-
-    gaps, owners = cKDTree(oxygens).query(hydrogens)
-    return bool((gaps < WATER_BOND_ANGSTROM).all()) and bool((np.bincount(owners, minlength=len(oxygens)) == 2).all())
+    """Whether the atoms of a residue are water, by its name and elements: oxygens with two hydrogens each at most, and
+    what a cell has left of them, hydrogens alone."""
+    oxygens, hydrogens = (sum(a.element == e for a in atoms) for e in "OH")
+    whole = oxygens + hydrogens == len(atoms) and hydrogens <= 2 * max(oxygens, 1)
+    return whole and is_water_name(atoms[0].residue_name)
 
 
 def resolve_solvent(
@@ -129,31 +105,32 @@ def resolve_solvent(
     Left out are waters unless `keep_water`, and free ions unless `keep_ions`: monatomic, no N, O or S of anything else
     within 3 Å. Of a file that holds nothing else, all stays.
     """
-    runs = [list(run) for _, run in groupby(kept, key=lambda i: atoms[i].residue_key)]
-    runs = [run for run in runs if not is_water_name(atoms[run[0]].residue_name)]
-    named: dict[ResidueKey, list[int]] = {}  # all oxygens may stand before all hydrogens
-    for i in kept:
-        if is_water_name(atoms[i].residue_name):
-            named.setdefault(atoms[i].residue_key, []).append(i)
-    runs += named.values()
+    # All oxygens of waters may stand before all hydrogens.
+    runs = [[kept[k] for k in members] for members in by_residue([atoms[i] for i in kept]).values()]
     water = [run for run in runs if is_water([atoms[i] for i in run])]
-    ions = [[i] for run in runs if are_ions([atoms[i] for i in run]) for i in run]
+    ions = [i for run in runs if are_ions([atoms[i] for i in run]) for i in run]
     wet = {i for run in water for i in run}
     cut = {i for run in water if not any(atoms[i].element == "O" for i in run) for i in run}
-    apart = wet | {i for run in ions for i in run}
+    apart = wet.union(ions)
     solute = [i for i in kept if i not in apart]
     if not solute:
         return list(kept), []
     n_waters = sum(atoms[i].element == "O" for i in wet)
-    waters = [f"{n_waters} water molecule{'s' if n_waters > 1 else ''}"] if n_waters and not keep_water else []
-    free = set() if keep_ions else _free(atoms, [run[0] for run in ions], solute)
+    free = set() if keep_ions else _free(atoms, ions, solute)
     count = Counter(atoms[i].residue_name for i in kept if i in free)
     names = listed([f"{n} {name}" if n > 1 else name for name, n in count.items()])
-    halves = [f"{len(cut)} hydrogen{'s' if len(cut) > 1 else ''} of waters without oxygen"] if cut else []
-    gone = [*waters, *halves, *([f"free ion{'s' if len(free) > 1 else ''} {names}"] if free else [])]
+    gone = [
+        *([_counted(n_waters, "water molecule")] if n_waters and not keep_water else []),
+        *([f"{_counted(len(cut), 'hydrogen')} of waters without oxygen"] if cut else []),
+        *([f"free ion{'s' if len(free) > 1 else ''} {names}"] if free else []),
+    ]
     if gone:
         notes.append(f"{' and '.join(gone)} left out")
     return [i for i in kept if i not in wet and i not in free], sorted(wet - cut) if keep_water else []
+
+
+def _counted(n: int, what: str) -> str:
+    return f"{n} {what}{'s' if n > 1 else ''}"
 
 
 def _free(atoms: Sequence[AtomRecord], ions: Sequence[int], solute: Sequence[int]) -> set[int]:
@@ -185,49 +162,45 @@ def ligand_atoms(atoms: Sequence[AtomRecord], bonding: Bonding) -> list[int]:
     return sorted(found)
 
 
-def agent_atoms(atoms: Sequence[AtomRecord], ligands: Sequence[int], notes: list[str]) -> list[int]:
-    """Indices of those ligands that are agents of crystallisation, buffers and counter-ions, by name and by elements;
-    `notes` says which are left out."""
-    found, names = [], []
-    for _, run in sorted(by_residue([atoms[i] for i in ligands]).items()):
-        members = [ligands[k] for k in run]
-        count = Counter(atoms[i].element for i in members if atoms[i].element != "H")
-        heavy = "".join(f"{e}{n if n > 1 else ''}" for e, n in sorted(count.items()))
-        if _AGENTS.get(atoms[members[0]].residue_name.upper()) == heavy:
-            found += members
-            names.append(atoms[members[0]].residue_name)
-    if found:
-        said = listed([f"{n} {name}" if n > 1 else name for name, n in Counter(names).items()])
-        notes.append(f"crystallisation agents and buffers left out (`keep_ligand=True` keeps them): {said}")
-    return sorted(found)
-
-
 def resolve_ligands(
     atoms: Sequence[AtomRecord], ligands: Sequence[int], *, keep: bool, drop: bool, notes: list[str]
-) -> bool:
-    """Whether the ligands stay. Raises PreparationError when neither keeping nor dropping was asked for."""
-    if not ligands:
-        return True
-    residues = list(dict.fromkeys(atoms[i].residue_key for i in ligands))
+) -> list[int]:
+    """Return which of the ligands stay; `notes` says which do, and which are left out.
+
+    Agents of crystallisation, buffers and counter-ions, known by name and elements, are left out unless `keep`. Raises
+    PreparationError for other ligands where neither keeping nor dropping was asked for, and for kept ones without
+    hydrogens.
+    """
+    residues = {key: [ligands[k] for k in run] for key, run in by_residue([atoms[i] for i in ligands]).items()}
+    if not (keep or drop):
+        agents = {key for key, members in residues.items() if _is_agent(key[2], [atoms[i].element for i in members])}
+        if agents:
+            count = Counter(name for _, _, name in sorted(agents))
+            said = listed([f"{n} {name}" if n > 1 else name for name, n in count.items()])
+            notes.append(f"crystallisation agents and buffers left out (`keep_ligand=True` keeps them): {said}")
+        residues = {key: members for key, members in residues.items() if key not in agents}
+    if not residues:
+        return []
     names = listed([f"{name} {chain}{number}" for chain, number, name in residues])
-    if keep:
-        notes.append(f"kept beside the peptide: {names}")
-        return True
-    if not drop:
+    if drop:
+        notes.append(f"left out, as asked (`drop_ligand=True`): {names}")
+        return []
+    if not keep:
         raise PreparationError(
             f"beside the peptide it holds {names}; add `keep_ligand=True` to simulate them, too, or `drop_ligand=True` "
             "to leave them out."
         )
-    notes.append(f"left out, as asked (`drop_ligand=True`): {names}")
-    return False
-
-
-def refuse_bare_ligands(atoms: Sequence[AtomRecord], ligands: Sequence[int]) -> None:
-    """A ligand with carbon and no hydrogen is one whose hydrogens the file leaves out. Raises PreparationError."""
-    for (chain, number, name), members in by_residue([atoms[i] for i in ligands]).items():
-        elements = {atoms[ligands[k]].element for k in members}
+    notes.append(f"kept beside the peptide: {names}")
+    for (chain, number, name), members in residues.items():
+        elements = {atoms[i].element for i in members}
         if ("C" in elements and "H" not in elements) or (elements == {"O"} and template_for(name) is None):
             raise PreparationError(
                 f"{name} {chain}{number} has no hydrogens, which a ligand must bring; add them (its SDF from the "
                 "Protein Data Bank has them), or leave it out with `drop_ligand=True`."
             )
+    return sorted(i for members in residues.values() for i in members)
+
+
+def _is_agent(name: str, elements: Sequence[str]) -> bool:
+    count = Counter(e for e in elements if e != "H")
+    return _AGENTS.get(name.upper()) == "".join(f"{e}{n if n > 1 else ''}" for e, n in sorted(count.items()))

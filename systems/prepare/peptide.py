@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from itertools import pairwise
 from typing import Any
 
 import numpy as np
 
-from systems.chemistry.geometry import extend, signed_volumes, superposition, torsion
+from systems.chemistry.geometry import extend, superposition
 from systems.chemistry.residues import ONE_LETTER, amino_acid_names, template_for
 from systems.errors import PreparationError, nearest
-from systems.prepare.records import D_RESIDUES, scene_from_records
+from systems.prepare.records import scene_from_records
 from systems.prepare.repair import fixed_random_numbers, protonation_summary, records_from_openmm, residue_shape
 from systems.scene import FloatArray, Scene
 
@@ -32,8 +31,12 @@ def parse_sequence(text: str) -> list[str]:
     if not word:
         raise PreparationError("The sequence is empty; write it like sequence:ACE-ALA-NME or sequence:SDFS.")
     names = [n.strip() for n in word.split("-")] if "-" in word or word in allowed else None
-    _refuse_d_residues(text, names)
     if names is None:
+        if not (text.strip().isupper() or text.strip().islower()):
+            raise PreparationError(
+                f"Sequence {text!r} mixes cases: a lower-case letter is a D-residue, and sequences are built of "
+                "L-residues alone; write capitals, or give a PDB file or a SMILES string."
+            )
         unknown = sorted({c for c in word if c not in ONE_LETTER})
         if unknown:
             raise PreparationError(
@@ -46,12 +49,12 @@ def parse_sequence(text: str) -> list[str]:
         if name not in allowed:
             raise PreparationError(
                 f"Sequence {text!r}: unknown residue {name!r}.{nearest(name, allowed)} "
-                "Known: the twenty amino acids, HID HIE HIP ASH GLH LYN, and the caps ACE and NME."
+                "Known: the twenty L-amino acids, HID HIE HIP ASH GLH LYN, and the caps ACE and NME."
             )
-        if (name == "ACE" and k != 0) or (name == "NME" and k != len(names) - 1):
-            raise PreparationError(f"Sequence {text!r}: the cap {name} stands inside; ACE goes first, NME last.")
-    if len(names) < 2 and names[0] in ("ACE", "NME"):
-        raise PreparationError(f"Sequence {text!r} is a cap alone; add an amino acid, as in ACE-ALA-NME.")
+        if name in ("ACE", "NME") and (len(names) == 1 or k != (0 if name == "ACE" else len(names) - 1)):
+            raise PreparationError(
+                f"Sequence {text!r}: the cap {name} stands alone or inside; ACE goes first, NME last (ACE-ALA-NME)."
+            )
     if len(names) > _LONGEST:
         raise PreparationError(
             f"Sequence of {len(names)} residues; chains are built up to {_LONGEST}, give a PDB file."
@@ -59,26 +62,10 @@ def parse_sequence(text: str) -> list[str]:
     return names
 
 
-def _refuse_d_residues(text: str, names: list[str] | None) -> None:
-    """D-residues by name (DAL), by prefix (D-ALA) or as a lower-case letter among capitals (SdFS)."""
-    if names is None:
-        written = text.strip()
-        found = "" if written.isupper() or written.islower() else next(c for c in written if c.islower())
-    else:
-        known = {*ONE_LETTER.values(), *_PROTONATED}
-        found = next((f"D-{b}" for a, b in pairwise(names) if a == "D" and b in known), "")
-        found = found or next((n for n in names if n in D_RESIDUES), "")
-    if found:
-        raise PreparationError(
-            f"Sequence {text!r}: {found!r} is a D-residue; sequences are built of L-residues alone, give a PDB file or "
-            "a SMILES string."
-        )
-
-
 def build_peptide(text: str, *, ph: float = 7.0) -> Scene:
     """Return an extended peptide, relaxed in ff14SB without charges; uncapped ends are charged.
 
-    Raises PreparationError for an unknown residue, or if a residue came out other than L or a peptide bond not trans.
+    Raises PreparationError for an unknown residue, or one that ff14SB lacks.
     """
     from openmm import Platform, app, unit
 
@@ -94,14 +81,12 @@ def build_peptide(text: str, *, ph: float = 7.0) -> Scene:
     records, bonds = records_from_openmm(modeller.topology, relaxed_nm, keys)
     labels = [f"{name} {number}" for _, number, name in keys]
     summary = protonation_summary(labels, keys, variants, records, ph)
-    scene = scene_from_records(
+    return scene_from_records(
         records,
         bonds,
         name="-".join(names),
         provenance={"source": "sequence", "sequence": "-".join(names), "ph": ph, "repairs": summary},
     )
-    _verify(scene)
-    return scene
 
 
 def _heavy_atoms(names: list[str]) -> tuple[Any, FloatArray]:
@@ -184,17 +169,3 @@ def _relaxed(modeller: Any) -> FloatArray:
     LocalEnergyMinimizer.minimize(context, 10.0, 500)
     positions = context.getState(positions=True).getPositions(asNumpy=True)
     return np.array(positions.value_in_unit(unit.nanometer), dtype=np.float64)
-
-
-def _verify(scene: Scene) -> None:
-    from systems.chemistry.graph import backbone_torsions
-
-    index = {(int(r), n): i for i, (r, n) in enumerate(zip(scene.residue_of_atom, scene.atom_names, strict=True))}
-    for k, name in enumerate(scene.residue_names):
-        if (k, "CB") in index:
-            row = [index[k, a] for a in ("CA", "N", "C", "CB")]
-            if not signed_volumes(scene.positions_nm, [row])[0] > 0:
-                raise PreparationError(f"{scene.name}: residue {name} {k + 1} was not built as L; give a PDB file.")
-    omega = torsion(scene.positions_nm, backbone_torsions(scene)["omega"])
-    if (np.abs(omega) < np.radians(150)).any():
-        raise PreparationError(f"{scene.name}: a peptide bond was not built trans; give a PDB file.")

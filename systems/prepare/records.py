@@ -6,7 +6,6 @@ from __future__ import annotations
 
 import hashlib
 import math
-import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -35,18 +34,14 @@ def suffix_of(path: Path) -> str:
 
 def read_text(path: Path, wanted: str) -> str:
     """Return the text of a file. Raises InputError, which asks for what is `wanted`, where it holds none."""
-    if path.is_dir():
-        raise InputError(f"{path} is a directory; give the file of {wanted}.")
     if not path.exists():
         raise InputError(f"{path} does not exist; check the path, or name a library system (`surromd systems`).")
     try:
         data = content(path)
     except (OSError, ValueError) as error:
         raise InputError(f"{path} cannot be read ({error}); check the file and its permissions.") from error
-    if not data.strip():
-        raise InputError(f"{path} is empty; give {wanted}.")
-    if b"\0" in data:
-        raise InputError(f"{path} is a binary file, no text; give {wanted}.")
+    if not data.strip() or b"\0" in data:
+        raise InputError(f"{path} is {'a binary file, no text' if data.strip() else 'empty'}; give {wanted}.")
     return data.decode("utf-8-sig", errors="replace").replace("\r\n", "\n")
 
 
@@ -58,10 +53,6 @@ def file_name_and_provenance(path: Path, repairs: list[str], **more: Any) -> dic
 
 
 # ---- atoms ----------------------------------------------------------------------------------------------------------
-
-
-# Narrower than float(), which also takes 1_0.5, tabs and the digits of other alphabets.
-_COORDINATE = re.compile(r" *[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)? *|\s*[-+]?(nan|inf)\w*\s*", re.ASCII | re.IGNORECASE)
 
 
 @dataclass(frozen=True)
@@ -107,15 +98,14 @@ class StructureFile:
     """The first model of a structure file: records in the file's order, the bonds it states, and what was passed over.
 
     `conect` holds the pairs of CONECT, LINK and SSBOND records (`_struct_conn` in mmCIF), `chain_ends` the atoms that a
-    TER record follows, or with which a chain of mmCIF ends. An atom whose element is not known has the element "", and
-    `unknown` says where it stands. `cell_nm`: box vectors `(3, 3)` of a periodic cell, None where the file has none.
+    TER record follows, or with which a chain of mmCIF ends. An atom whose element is not known has the element "".
+    `cell_nm`: box vectors `(3, 3)` of a periodic cell, None where the file has none.
     """
 
     atoms: list[AtomRecord]
     conect: list[tuple[int, int]] = field(default_factory=list)
     chain_ends: set[int] = field(default_factory=set)
     notes: list[str] = field(default_factory=list)
-    unknown: dict[int, str] = field(default_factory=dict)
     cell_nm: FloatArray | None = None
 
     def only(self, kept: Sequence[int]) -> StructureFile:
@@ -123,20 +113,12 @@ class StructureFile:
         new = {old: k for k, old in enumerate(kept)}
         ends = {int(k) - 1 for k in np.searchsorted(kept, sorted(self.chain_ends), side="right")} - {-1}
         conect = [(new[i], new[j]) for i, j in self.conect if i in new and j in new]
-        return replace(self, atoms=[self.atoms[i] for i in kept], conect=conect, chain_ends=ends, unknown={})
+        return replace(self, atoms=[self.atoms[i] for i in kept], conect=conect, chain_ends=ends)
 
     def without(self, left_out: Sequence[int] | set[int]) -> StructureFile:
         """Return all atoms but these."""
         gone = set(left_out)
         return self.only([i for i in range(len(self.atoms)) if i not in gone])
-
-
-def coordinates(fields: Sequence[str]) -> tuple[float, float, float] | None:
-    """Return three coordinates written as plain decimal numbers, or None where one is written otherwise."""
-    if not all(_COORDINATE.fullmatch(text) for text in fields):
-        return None
-    x, y, z = (float(text) for text in fields)
-    return x, y, z
 
 
 # ---- residues and their bonds, as `systems.prepare.bonding` finds them ----------------------------------------------
@@ -186,11 +168,6 @@ class Bonding:
 # ---- modified residues ----------------------------------------------------------------------------------------------
 
 
-D_RESIDUES = {
-    "DAL": "ALA", "DAR": "ARG", "DSG": "ASN", "DAS": "ASP", "DCY": "CYS", "DGN": "GLN", "DGL": "GLU", "DHI": "HIS",
-    "DIL": "ILE", "DLE": "LEU", "DLY": "LYS", "MED": "MET", "DPN": "PHE", "DPR": "PRO", "DSN": "SER", "DTH": "THR",
-    "DTR": "TRP", "DTY": "TYR", "DVA": "VAL",
-}  # fmt: skip
 _CAP_BOND_ANGSTROM = 1.3
 # The patches ACE and CT3 of CHARMM write caps into the first and the last residue.
 _PATCHES = {"ACE": ("CAY", "CY", "OY"), "NME": ("NT", "CAT")}

@@ -7,11 +7,11 @@ from __future__ import annotations
 import contextlib
 import io
 import random
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import lru_cache
 from importlib.resources import files
-from itertools import permutations, product
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -50,7 +50,12 @@ def complete(
     residues = [r for chain in chains for r in chain]
     text = _heavy_atom_text(atoms, chains)
     neighbours = bonding.neighbours
-    closed = {r.key for chain in chains if _is_cycle(chain, bonding) for r in (chain[0], chain[-1])}
+    closed = {
+        end.key
+        for chain in chains
+        for end in (chain[0], chain[-1])
+        if (chain[-1].heavy.get("C", -1), chain[0].heavy.get("N", -1)) in bonding.peptide_bonds
+    }
     variants = [
         asked_hydrogens(residue, atoms, neighbours, ph=ph, in_cycle=residue.key in closed) for residue in residues
     ]
@@ -72,14 +77,10 @@ def complete(
         raise PreparationError(f"PDBFixer could not complete the structure ({first_line(error)}).") from error
     positions_nm = np.array(modeller.positions.value_in_unit(unit.nanometer), dtype=np.float64)
     records, bonds = records_from_openmm(modeller.topology, positions_nm, [r.key for r in residues])
-    _refuse_lost_bonds(records, bonds, atoms, bonding)
     names = {(r.key, a) for r in residues for a in r.heavy}
     records = _with_usual_lengths(records, bonds, names)
     records = _keep_hydrogens(records, bonds, atoms, bonding)
     summary = _summary(residues, records, ph) + rebuilt
-    replaced = _with_replaced_hydrogens(residues, records, atoms)
-    if replaced:
-        summary.append(f"hydrogens of the file replaced on {listed(replaced)}: their atoms have others now")
     summary += protonation_summary([r.label for r in residues], [r.key for r in residues], variants, records, ph)
     if [a.name for a in records if a.element != "H"] != [a.name for a in atoms if a.element != "H"]:
         summary.append("atoms stand in the standard order under their standard names")
@@ -183,10 +184,6 @@ def _chains(bonding: Bonding) -> list[list[Residue]]:
     return chains
 
 
-def _is_cycle(chain: Sequence[Residue], bonding: Bonding) -> bool:
-    return (chain[-1].heavy.get("C", -1), chain[0].heavy.get("N", -1)) in bonding.peptide_bonds
-
-
 def _heavy_atom_text(atoms: Sequence[AtomRecord], chains: Sequence[Sequence[Residue]]) -> str:
     lines: list[str] = []
     number = 0
@@ -261,27 +258,12 @@ def _with_usual_lengths(
     return out
 
 
-def _refuse_lost_bonds(
-    records: Sequence[AtomRecord],
-    bonds: IntArray,
-    atoms: Sequence[AtomRecord],
-    bonding: Bonding,
-) -> None:
-    """Every heavy-atom bond of the file must be there after the repair: cross-links other than disulfides are not."""
-    name_of = {i: (r.key, a) for r in bonding.residues for a, i in r.heavy.items()}
-    made = {frozenset((a.residue_key, a.name) for a in (records[i], records[j])) for i, j in bonds.tolist()}
-    for i, j in bonding.bonds.tolist():
-        if i in name_of and j in name_of and frozenset((name_of[i], name_of[j])) not in made:
-            raise PreparationError(
-                f"atoms are missing, and the bond {atoms[i].label} - {atoms[j].label} would be lost in "
-                "adding them; give the structure with all hydrogens."
-            )
-
-
 def _keep_hydrogens(
     records: list[AtomRecord], bonds: IntArray, atoms: Sequence[AtomRecord], bonding: Bonding
 ) -> list[AtomRecord]:
     """Put the file's hydrogens back where a heavy atom has as many as before."""
+    from scipy.optimize import linear_sum_assignment
+
     whole = {r.key: r for r in bonding.residues if r.heavy and not r.lacks_hydrogens}
     before, after = bonding.neighbours, neighbours_of(bonds, len(records))
     out = list(records)
@@ -293,25 +275,10 @@ def _keep_hydrogens(
         if not new or len(old) != len(new):
             continue
 
-        def moved(chosen: Iterable[int], new: list[int] = new) -> float:
-            return sum(distance_angstrom(atoms[i], records[j]) ** 2 for i, j in zip(chosen, new, strict=True))
-
-        for a, b in zip(new, min(permutations(old), key=moved), strict=True):
-            out[a] = replace(records[a], position_angstrom=atoms[b].position_angstrom)
+        cost = [[distance_angstrom(records[j], atoms[i]) ** 2 for i in old] for j in new]
+        for a, b in zip(*linear_sum_assignment(cost), strict=True):
+            out[new[a]] = replace(records[new[a]], position_angstrom=atoms[old[b]].position_angstrom)
     return out
-
-
-def _with_replaced_hydrogens(
-    residues: Sequence[Residue], records: Sequence[AtomRecord], atoms: Sequence[AtomRecord]
-) -> list[str]:
-    """Labels of residues that had all their hydrogens and did not keep them: an end that became one, say."""
-    kept = {(a.residue_key, a.position_angstrom) for a in records if a.element == "H"}
-    return [
-        r.label
-        for r in residues
-        if not r.lacks_hydrogens
-        and any(atoms[i].element == "H" and (r.key, atoms[i].position_angstrom) not in kept for i in r.atoms)
-    ]
 
 
 def _summary(residues: Sequence[Residue], records: Sequence[AtomRecord], ph: float) -> list[str]:
@@ -320,17 +287,16 @@ def _summary(residues: Sequence[Residue], records: Sequence[AtomRecord], ph: flo
         if residue.missing:
             end = " (the chain ends here, as a carboxylate)" if "OXT" in residue.missing else ""
             notes.append(f"{residue.label}: added {' '.join(residue.missing)}{end}")
-    short = [r.label for r in residues if r.lacks_hydrogens]
-    by_dictionary = [r.label for r in residues if r.lacks_hydrogens and template_for(r.key[2]) is None]
+    short = {r.key: r.label for r in residues if r.lacks_hydrogens}
+    by_dictionary = [label for key, label in short.items() if template_for(key[2]) is None]
     if by_dictionary:
         notes.append(
             f"their hydrogens by the chemical component dictionary, groups charged as at pH {ph:g}: "
             f"{listed(by_dictionary)}"
         )
     if short:
-        of_short = {r.key for r in residues if r.lacks_hydrogens}
-        n = sum(a.element == "H" and a.residue_key in of_short for a in records)
-        notes.append(f"hydrogens placed on {listed(short)}: {n}")
+        n = sum(a.element == "H" and a.residue_key in short for a in records)
+        notes.append(f"hydrogens placed on {listed(list(short.values()))}: {n}")
     return notes
 
 
@@ -430,13 +396,11 @@ def protonation_summary(
 # its rotamers (60°, 180°, -60°; every 30° where a planar group turns: the centres of Dunbrack's library, Acta Cryst.
 # D58, 1862 (2002)), and the conformer farthest from all other heavy atoms is taken.
 
-Sites = dict[str, int]
-
 _STAGGERED = (-60.0, 180.0, 60.0)
 _PLANAR = tuple(float(k) for k in range(-180, 180, 30))
 # The atom at the end of the last torsion that turns a planar group.
 _PLANAR_AT = {"ASP": "CG", "ASN": "CG", "PHE": "CG", "TYR": "CG", "TRP": "CG", "HIS": "CG", "GLU": "CD", "GLN": "CD"}
-_RIGID = frozenset({frozenset(("NE", "CZ"))})
+_RIGID = frozenset(("NE", "CZ"))
 _BACKBONE = frozenset(("N", "C", "O", "OXT"))
 # Hydrogen bonds of heavy atoms start at 2.4 Å, contacts with carbon and sulfur at 3.0: nearer than the first an added
 # atom is built again, nearer than the second nothing is left to part.
@@ -455,7 +419,7 @@ def resolve_side_chains(
     positions_nm: FloatArray,
     elements: Sequence[str],
     bonds: Sequence[tuple[int, int]],
-    residues: Sequence[tuple[str, str, Sites, Sequence[str]]],
+    residues: Sequence[tuple[str, str, dict[str, int], Sequence[str]]],
 ) -> list[str]:
     """Build added side chains that overlap again, in place; return a line for each.
 
@@ -485,24 +449,24 @@ def resolve_side_chains(
         joined = [(i, j) for i, j in bonds if i in idx or j in idx]
         ratio = [float(np.linalg.norm(positions_nm[i] - positions_nm[j]) / (radii[i] + radii[j])) for i, j in joined]
         off = any(not 0.75 < r < 1.25 for r in ratio)
-        least, margin = clearance(positions_nm)
-        if not off and margin >= 0:
+        least, margin = (-np.inf, -np.inf) if off else clearance(positions_nm)
+        if margin >= 0:
             continue
-        best = positions_nm.copy() if not off else None
+        best = positions_nm
         for trial in _conformers(name, {a: positions_nm[i] for a, i in sites.items() if a not in moved}, moved):
             x = positions_nm.copy()
             x[idx] = [trial[a] for a in moved]
             of_trial = clearance(x)
-            if best is None or of_trial[1] > margin + 1e-6:
+            if of_trial[1] > margin + 1e-6:
                 best, (least, margin) = x, of_trial
-        if best is None:
+        if off and best is positions_nm:
             continue  # its bonds are refused with their lengths
         if 10.0 * least < _OVERLAP_ANGSTROM:
             raise PreparationError(
                 f"{label}: {' '.join(moved)}, which were missing, come out {10 * least:.2f} Å from another heavy atom "
                 "in every rotamer; give the residue with all its heavy atoms, or make place for it."
             )
-        if not np.array_equal(best, positions_nm):
+        if best is not positions_nm:
             positions_nm[:] = best
             notes.append(f"{label}: {' '.join(moved)} overlapped and were built again in the rotamer with most room")
     return notes
@@ -516,20 +480,19 @@ def _conformers(name: str, there: Mapping[str, FloatArray], moved: Sequence[str]
     if name == "PRO" or any(a not in shape or a not in tree for a in moved) or not {"N", "CA", "CB"} <= set(there):
         return []
     order = [a for a in tree if a in moved]
-    axes: list[tuple[str, str, str, str, tuple[float, ...]]] = []
+    turning = {frozenset(bond) for bond in nx.bridges(_skeleton(name))} - {_RIGID}
+    axes: dict[tuple[str, str], tuple[str, str, tuple[float, ...]]] = {}
     for atom, (p, g, q) in tree.items():
-        if any(axis[1:3] == (g, p) for axis in axes) or frozenset((g, p)) in _RIGID:
-            continue
-        if _turns(name, g, p):
-            values: tuple[float, ...] = _PLANAR if _PLANAR_AT.get(name) == p else _STAGGERED
+        if (g, p) not in axes and frozenset((g, p)) in turning:
             fixed = next((b for b, (pb, _, _) in tree.items() if pb == p and b in there), None)
-            if fixed is not None:
-                values = (_torsion_deg(there, q, g, p, fixed),)
-            axes.append((q, g, p, fixed or atom, values))
+            if fixed is None:
+                axes[g, p] = q, atom, _PLANAR if _PLANAR_AT.get(name) == p else _STAGGERED
+            else:
+                axes[g, p] = q, fixed, (_torsion_deg(there, q, g, p, fixed),)
     out = []
-    for chosen in product(*(values for *_, values in axes)):
+    for chosen in product(*(values for *_, values in axes.values())):
         turn = {(g, p): value - _torsion_deg(shape, q, g, p, d)
-                for (q, g, p, d, _), value in zip(axes, chosen, strict=True)}  # fmt: skip
+                for ((g, p), (q, d, _)), value in zip(axes.items(), chosen, strict=True)}  # fmt: skip
         placed = dict(there)
         for atom in order:
             p, g, q = tree[atom]
@@ -558,13 +521,6 @@ def _tree(name: str) -> dict[str, tuple[str, str, str]]:
     graph = graph.subgraph([a for a in graph if a not in _BACKBONE])
     parent = {"CA": "N", **{b: a for a, b in nx.bfs_edges(graph, "CA")}}
     return {a: (parent[a], parent[parent[a]], parent[parent[parent[a]]]) for a in parent if a not in ("CA", "CB")}
-
-
-def _turns(name: str, a: str, b: str) -> bool:
-    """Whether the bond is in no ring."""
-    graph = _skeleton(name).copy()
-    graph.remove_edge(a, b)
-    return not nx.has_path(graph, a, b)
 
 
 def _torsion_deg(shape: Mapping[str, FloatArray], *names: str) -> float:

@@ -1,19 +1,21 @@
 """PDB and mmCIF files, read as atom records: order and names of the file survive.
 
-PDB text is read column by column and strictly; gemmi reads what the header says of bonds, and the syntax of mmCIF. It
-reads ATOM records, too, and is not used for them: it takes `**.***` and blanks for 0, joins the parts of a residue that
-stand apart, and cuts residue names at three letters (TIP3 becomes TIP of chain 3). Duplicates and virtual sites are
-left out, repeated residue numbers told apart.
+gemmi reads mmCIF, and what the header of a PDB file says of bonds and the cell. Atoms of PDB text are read column by
+column and strictly: gemmi takes `**.***` and blanks for 0, joins the parts of a residue that stand apart, and cuts
+residue names at three letters (TIP3 becomes TIP of chain 3). Duplicates and virtual sites are left out, repeated
+residue numbers told apart.
 """
 
 from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from systems.chemistry.distance_bonds import cell_of
 from systems.chemistry.element_data import element_symbol, repeats_name
@@ -24,20 +26,14 @@ from systems.prepare.records import (
     ResidueKey,
     StructureFile,
     by_residue,
-    coordinates,
     distance_angstrom,
     read_text,
     suffix_of,
 )
-from systems.scene import FloatArray
 
 _PDB_SUFFIXES = (".pdb", ".ent")
 _CIF_SUFFIXES = (".cif", ".mmcif")
 _FARTHEST_ANGSTROM = 9_999.0
-_DIGITS = "0123456789ABCDEFGHIJKLMNOPQRSTUVWXYZ"
-_SYMMETRIC = "they lead to a symmetry copy"
-# (chain, number with insertion code, residue name, atom name)
-Address = tuple[str, str, str, str]
 
 
 def read_structure(path: Path) -> StructureFile:
@@ -47,29 +43,19 @@ def read_structure(path: Path) -> StructureFile:
     neither, bytes that are no text, a record that cannot be read, no atoms, or positions that are not finite.
     """
     text = structure_text(path)
-    if is_mmcif(path):
-        try:
-            found = _read_mmcif(text, path)
-        except RuntimeError as error:  # gemmi's, of tables whose tags do not go together
-            raise InputError(f"{path} is damaged ({first_line(error)}); fetch it again.") from error
-    else:
-        found = _read_pdb(text, path)
-    if not found.atoms and "_atom_site_fract_x" in text.lower():
-        raise InputError(f"{path} is the CIF of a crystal, in fractions of its cell; give one molecule as SDF or PDB.")
+    found = _read_mmcif(text, path) if is_mmcif(path) else _read_pdb(text, path)
     if not found.atoms:
-        raise InputError(f"{path} holds no ATOM or HETATM record; give a PDB or mmCIF file with coordinates.")
+        raise InputError(
+            f"{path} holds no ATOM or HETATM record (the CIF of a crystal, in fractions of its cell, has none); give a "
+            "PDB or mmCIF file with coordinates."
+        )
     for atom in found.atoms:
-        if not all(math.isfinite(x) for x in atom.position_angstrom):
+        if not all(abs(x) <= _FARTHEST_ANGSTROM for x in atom.position_angstrom):
             raise InputError(
-                f"{path}: atom {atom.serial} ({atom.name}) has a position that is not a number; "
-                "write the structure again from the program that made it."
+                f"{path}: atom {atom.serial} ({atom.name}) has a position that is not a number, or lies beyond "
+                f"{_FARTHEST_ANGSTROM:,.0f} Å; correct the coordinate, or centre the structure."
             )
-        if any(abs(x) > _FARTHEST_ANGSTROM for x in atom.position_angstrom):
-            raise InputError(
-                f"{path}: atom {atom.serial} ({atom.name}) lies beyond {_FARTHEST_ANGSTROM:,.0f} Å; "
-                "centre the structure, or correct the coordinate."
-            )
-    return _cleaned(found)
+    return _cleaned(found, path)
 
 
 def is_mmcif(path: Path) -> bool:
@@ -81,95 +67,55 @@ def structure_text(path: Path) -> str:
     """Return the text of a PDB or mmCIF file. Raises InputError for what is none."""
     known = ", ".join((*_PDB_SUFFIXES, *_CIF_SUFFIXES))
     if path.is_file() and suffix_of(path) not in (*_PDB_SUFFIXES, *_CIF_SUFFIXES):
-        raise InputError(f"{path} has suffix {path.suffix!r}; structures are read from {known}, also gzipped.")
+        raise InputError(
+            f"{path} has suffix {path.suffix!r}; structures are read from {known} (also gzipped), molecules from "
+            ".sdf, .mol and .mol2."
+        )
     return read_text(path, f"a structure with coordinates ({known})")
 
 
-# ---- bonds that headers state ---------------------------------------------------------------------------------------
+def _add_header(structure: Any, found: StructureFile) -> None:
+    """Add the cell and the covalent bonds of a `gemmi.Structure`; of alternates, those that go together are bonded.
 
-
-def _addressed(
-    ends: Iterable[Sequence[Address]], elsewhere: Iterable[Sequence[Address]], found: StructureFile
-) -> set[tuple[int, int]]:
-    """Return the index pairs of atoms named by chain, residue and name; of alternates, those that go together.
-
-    Notes say for which of the bonds the file has no such two atoms, and which lead `elsewhere`.
+    A note says which of the bonds lead to a symmetry copy, or to atoms that the file does not have.
     """
-    index: dict[Address, list[int]] = {}
-    for i, atom in enumerate(found.atoms):
-        index.setdefault((*atom.residue_key, atom.name), []).append(i)
-    pairs: set[tuple[int, int]] = set()
-    absent = []
-    for first, second in ends:
-        those = {
-            (min(i, j), max(i, j))
-            for i in index.get(first, ())
-            for j in index.get(second, ())
-            if i != j and len({found.atoms[i].altloc, found.atoms[j].altloc} - {""}) < 2
-        }
-        pairs |= those
-        absent += [] if those else [(first, second)]
-    for unused, reason in ((elsewhere, _SYMMETRIC), (absent, "the file has no such two atoms together")):
-        names = [" - ".join(f"{name} {chain}{n} {atom}" for chain, n, name, atom in pair) for pair in unused]
-        if names:
-            found.notes.append(f"records of bonds not used, as {reason}: {listed(names)}")
-    return pairs
-
-
-def _links(header: list[str], found: StructureFile) -> set[tuple[int, int]]:
-    """Return the index pairs of LINK and SSBOND records that join atoms of the same asymmetric unit."""
-    if not header:
-        return set()
     import gemmi
 
-    structure = gemmi.read_pdb_string("\n".join(header) + "\n")
-    ends = {
-        tuple(
-            (p.chain_name, str(p.res_id.seqid), p.res_id.name, p.atom_name) for p in (link.partner1, link.partner2)
-        ): (link.asu == gemmi.Asu.Different)
-        for link in structure.connections
-        if link.type in (gemmi.ConnectionType.Covale, gemmi.ConnectionType.Disulf)
-    }
-    return _addressed([p for p, away in ends.items() if not away], [p for p, away in ends.items() if away], found)
-
-
-def _connections(block: Any, found: StructureFile) -> set[tuple[int, int]]:
-    """Return the index pairs of covalent bonds of `_struct_conn`, by the authors' names."""
-    names = ("auth_asym_id", "auth_seq_id", "auth_comp_id", "label_atom_id")
-    tags = [f"ptnr{k}_{name}" for k in (1, 2) for name in names]
-    optional = [tag for k in (1, 2) for tag in (f"?pdbx_ptnr{k}_PDB_ins_code", f"?ptnr{k}_symmetry")]
-    here: list[Sequence[Address]] = []
-    elsewhere: list[Sequence[Address]] = []
-    for row in block.find("_struct_conn.", ["conn_type_id", *tags, *optional]):
-        if not row.str(0).lower().startswith(("covale", "disulf")):
+    found.cell_nm = cell_of(structure.cell.parameters)
+    index: dict[tuple[str, str, str, str], list[int]] = {}
+    for i, atom in enumerate(found.atoms):
+        index.setdefault((*atom.residue_key, atom.name), []).append(i)
+    pairs = set(found.conect)
+    unused = []
+    for link in structure.connections:
+        if link.type not in (gemmi.ConnectionType.Covale, gemmi.ConnectionType.Disulf):
             continue
-        ends: list[Address] = []
-        for start, insertion in ((1, 9), (5, 11)):
-            chain, number, name, atom = (row.str(start + k) for k in range(4))
-            ends.append((chain, number + (row.str(insertion) if row.has(insertion) else ""), name, atom))
-        symmetry = {row.str(k) for k in (10, 12) if row.has(k)}
-        (here if len(symmetry) < 2 else elsewhere).append(ends)
-    return _addressed(here, elsewhere, found)
+        ends = [(p.chain_name, str(p.res_id.seqid), p.res_id.name, p.atom_name) for p in (link.partner1, link.partner2)]
+        those = {
+            (min(i, j), max(i, j))
+            for i in index.get(ends[0], ())
+            for j in index.get(ends[1], ())
+            if i != j and len({found.atoms[i].altloc, found.atoms[j].altloc} - {""}) < 2
+        }
+        if those and link.asu != gemmi.Asu.Different:
+            pairs |= those
+        else:
+            unused.append(" - ".join(f"{residue} {chain}{number} {atom}" for chain, number, residue, atom in ends))
+    found.conect = sorted(pairs)
+    if unused:
+        found.notes.append(
+            "records of bonds not used, as they lead to a symmetry copy, or the file has no such two atoms together: "
+            f"{listed(list(dict.fromkeys(unused)))}"
+        )
 
 
 # ---- columns of PDB files -------------------------------------------------------------------------------------------
 
 
-# All records of the PDB format, version 3.3 and before, and those that other programs add.
-_RECORDS = frozenset((
-    "HEADER", "OBSLTE", "TITLE", "SPLIT", "CAVEAT", "COMPND", "SOURCE", "KEYWDS", "EXPDTA", "NUMMDL", "MDLTYP",
-    "AUTHOR", "REVDAT", "SPRSDE", "JRNL", "REMARK", "FTNOTE", "DBREF", "DBREF1", "DBREF2", "SEQADV", "SEQRES", "MODRES",
-    "HET", "HETNAM", "HETSYN", "FORMUL", "HELIX", "SHEET", "TURN", "SSBOND", "LINK", "LINKR", "HYDBND", "SLTBRG",
-    "CISPEP", "SITE", "CRYST1", "ORIGX1", "ORIGX2", "ORIGX3", "SCALE1", "SCALE2", "SCALE3", "MTRIX1", "MTRIX2",
-    "MTRIX3", "TVECT", "MODEL", "ATOM", "ANISOU", "SIGATM", "SIGUIJ", "TER", "HETATM", "ENDMDL", "CONECT", "MASTER",
-    "END", "USER",
-))  # fmt: skip
-# An atom under a misspelt record, and no table of energies: %8.3f three times, blanks before.
-_WRITTEN = re.compile(r" *-?\d+\.\d{3}", re.ASCII)
-
-
 def _read_pdb(text: str, path: Path) -> StructureFile:
     """Return the first model of the first structure. Raises InputError for an atom record that is not in columns."""
+    import gemmi
+
     found = StructureFile([])
     index_of: dict[str, int] = {}
     repeated: set[str] = set()
@@ -194,13 +140,11 @@ def _read_pdb(text: str, path: Path) -> StructureFile:
         elif record == "ENDMDL":
             model_ended = bool(found.atoms)
         elif is_atom and not model_ended:
-            atom, where = _pdb_atom(line, number, path)
+            atom = _pdb_atom(line, number, path)
             if atom.serial in index_of:
                 repeated.add(atom.serial)
             index_of[atom.serial] = len(found.atoms)
             n_misread += repeats_name(atom.name, atom.residue_name, line[76:78].strip().capitalize())
-            if not atom.element:
-                found.unknown[len(found.atoms)] = where
             named = line[72:76].strip()  # CHARMM's segment, where there is no chain; other programs put numbers there
             segment, before = named if not atom.chain and named[:1].isalpha() else "", segment
             if found.atoms and segment != before:
@@ -210,22 +154,8 @@ def _read_pdb(text: str, path: Path) -> StructureFile:
             found.chain_ends.add(len(found.atoms) - 1)
         elif word == "CONECT":
             conect_lines.append(line)
-        elif word in ("LINK", "LINKR", "SSBOND"):
+        elif word in ("LINK", "LINKR", "SSBOND", "CRYST1"):
             header.append(line)
-        elif word == "CRYST1" and found.cell_nm is None:
-            found.cell_nm = _cell([line[a:b] for a, b in ((6, 15), (15, 24), (24, 33), (33, 40), (40, 47), (47, 54))])
-        elif (
-            word not in _RECORDS
-            and not is_atom
-            and not model_ended
-            and len(line) > 66
-            and not line[27:30].strip()
-            and all(_WRITTEN.fullmatch(field) for field in _fields(line))
-        ):
-            raise InputError(
-                f"{path}, line {number}: {record!r} is no record of the PDB format, but the line looks like an atom; "
-                "write ATOM or HETATM there, or take the line out."
-            )
     if n_misread:
         found.notes.append(f"{n_misread} atoms whose element column repeats the atom's name: elements taken from names")
     if n_models > 1:
@@ -235,56 +165,38 @@ def _read_pdb(text: str, path: Path) -> StructureFile:
     pairs, ignored = _conect(conect_lines, index_of, repeated)
     if ignored:
         found.notes.append(f"{ignored} CONECT entries name no single atom of the file and are ignored")
-    found.conect = sorted(pairs | _links(header, found))
+    found.conect = sorted(pairs)
+    _add_header(gemmi.read_pdb_string("\n".join([*header, ""])), found)
     return found
 
 
-def _fields(line: str) -> list[str]:
-    return [line[k : k + 8] for k in (30, 38, 46)]
+# Narrower than float(), which also takes 1_0.5, tabs and the digits of other alphabets.
+_COORDINATE = re.compile(r" *[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)? *|\s*[-+]?(nan|inf)\w*\s*", re.ASCII | re.IGNORECASE)
 
 
-def _cell(fields: Sequence[str]) -> FloatArray | None:
-    """Box vectors `(3, 3)` nm of lengths in Å and angles in degrees, or None."""
-    try:
-        return cell_of([float(_UNCERTAINTY.sub("", field)) for field in fields])
-    except ValueError:
-        return None
-
-
-def _pdb_atom(line: str, number: int, path: Path) -> tuple[AtomRecord, str]:
-    """Return the record, and what to say of it if its element stays unknown."""
-    if len(line) < 54:
-        raise InputError(f"{path}, line {number}: the atom record is cut short; fetch or write the file again.")
-    position = coordinates(_fields(line))
-    if position is None:
+def _pdb_atom(line: str, number: int, path: Path) -> AtomRecord:
+    fields = [line[k : k + 8] for k in (30, 38, 46)]
+    if len(line) < 54 or not all(_COORDINATE.fullmatch(text) for text in fields):
         raise InputError(
-            f"{path}, line {number}: columns 31-54 hold {line[30:54]!r}, not three coordinates; "
-            "write the file again as standard PDB."
+            f"{path}, line {number}: columns 31-54 hold {line[30:54]!r}, not three coordinates; the file is cut short, "
+            "or no standard PDB: write it again."
         )
+    x, y, z = (float(text) for text in fields)
     name_field = line[12:16]
     residue_name = line[17:21].strip()  # four letters where a program needs them (TIP3), the standard leaves one blank
     hetero = line.startswith("HETATM")
     symbol = element_symbol(name_field, residue_name, line[76:78].strip(), hetero=hetero) or ""
+    number_read = decode(line[22:26], 4)
+    residue_id = (line[22:26].strip() or "1") if number_read is None else str(number_read)
     try:
         occupancy = float(line[54:60])
     except ValueError:
         occupancy = 1.0
-    atom = AtomRecord(
+    return AtomRecord(
         name_field.strip() or symbol, symbol, residue_name or "UNL", line[21].strip(),
-        _residue_id(line[22:26], line[26:27]), position, occupancy=occupancy, altloc=line[16].strip(), hetero=hetero,
+        residue_id + line[26:27].strip(), (x, y, z), occupancy=occupancy, altloc=line[16].strip(), hetero=hetero,
         serial=(line[6:11] if line[5] == " " or hetero else line[5:11]).strip(),
     )  # fmt: skip
-    return atom, (
-        f"{path}, line {number}: atom {name_field.strip()!r} of {residue_name} has no recognisable element; "
-        "fill columns 77-78."
-    )
-
-
-def _residue_id(number: str, insertion: str) -> str:
-    """`181A`: the number, decimal where the file has it in hybrid-36, and the insertion code."""
-    text = number.strip() or "1"
-    value = decode(number, 4)
-    return (text if value is None or text.lstrip("-").isdigit() else str(value)) + insertion.strip()
 
 
 def decode(field: str, width: int) -> int | None:
@@ -295,13 +207,11 @@ def decode(field: str, width: int) -> int | None:
     text = field.strip()
     if text.lstrip("-").isdigit():
         return int(text)
-    if len(text) != width or not text[0].isalpha() or not text.isascii() or not text.isalnum():
+    if not (len(text) == width and text.isascii() and text.isalnum() and text[0].isalpha()):
         return None
-    lower = text[0].islower()
-    if any(c.isalpha() and c.islower() != lower for c in text):
+    if text not in (text.lower(), text.upper()):
         return None
-    start = 10**width + (26 * 36 ** (width - 1) if lower else 0)
-    return start + int(text, 36) - 10 * 36 ** (width - 1)
+    return int(text, 36) + 10**width + (16 if text.islower() else -10) * 36 ** (width - 1)
 
 
 def encode(number: int, width: int) -> str | None:
@@ -312,13 +222,8 @@ def encode(number: int, width: int) -> str | None:
     block = 26 * 36 ** (width - 1)
     if not 0 <= value < 2 * block:
         return None
-    lower = value >= block
-    value = value % block + 10 * 36 ** (width - 1)
-    text = ""
-    while value:
-        value, digit = divmod(value, 36)
-        text = _DIGITS[digit] + text
-    return text.lower() if lower else text
+    text = np.base_repr(value % block + 10 * 36 ** (width - 1), 36)
+    return text if value < block else text.lower()
 
 
 def pdb_atom(
@@ -353,100 +258,56 @@ def _conect(lines: list[str], index_of: dict[str, int], repeated: set[str]) -> t
 # ---- mmCIF ----------------------------------------------------------------------------------------------------------
 
 
-_NEEDED = ("Cartn_x", "Cartn_y", "Cartn_z", "label_atom_id")
-_OPTIONAL = (
-    "group_PDB", "id", "type_symbol", "label_alt_id", "label_comp_id", "label_asym_id", "label_seq_id",
-    "auth_atom_id", "auth_comp_id", "auth_asym_id", "auth_seq_id", "pdbx_PDB_ins_code", "occupancy",
-    "pdbx_PDB_model_num",
-)  # fmt: skip
-_ANGLES = ("alpha", "beta", "gamma")
-_UNCERTAINTY = re.compile(r"\(\d+\)$")
-
-
-def read_blocks(text: str, path: Path) -> Any:
-    """Return the `gemmi.cif.Document` of a file. Raises InputError where the syntax is broken.
+def read_blocks(text: str, path: Path, category: str) -> list[Any]:
+    """Return the `gemmi.cif.Block`s of a file that have a category. Raises InputError where the syntax is broken.
 
     What other programs get wrong beside the atoms (a tag twice, one without a value, letters beyond ASCII in a title)
     does no harm.
     """
     from gemmi import cif
 
-    if not text.isascii():
-        if any(not line.isascii() for line in text.splitlines() if line.startswith(("ATOM", "HETATM"))):
-            raise InputError(f"{path}: a row of atoms has letters beyond ASCII; the file is damaged, fetch it again.")
-        text = text.encode("ascii", "replace").decode()
     try:
-        return cif.read_string(text, check_level=0)
+        document = cif.read_string(text.encode("ascii", "replace").decode(), check_level=0)
+        return [block for block in document if block.find_mmcif_category(category)]
     except (ValueError, RuntimeError) as error:
         reason = first_line(error).removeprefix("string:")
         raise InputError(f"{path} is no whole CIF ({reason}); the file is cut or damaged, fetch it again.") from error
 
 
-def is_component(text: str) -> bool:
-    """Whether mmCIF text defines a component and holds no structure."""
-    return "_chem_comp_atom." in text and "_atom_site." not in text
-
-
 def _read_mmcif(text: str, path: Path) -> StructureFile:
+    import gemmi
+
     found = StructureFile([])
-    blocks = [b for b in read_blocks(text, path) if b.find_mmcif_category("_atom_site.")]
+    blocks = read_blocks(text, path, "_atom_site.")
     if not blocks:
         return found
-    if len(blocks) > 1:
-        found.notes.append(f"{len(blocks)} structures in the file: the first is taken")
-    given = [tag.split(".", 1)[-1].lower() for tag in blocks[0].find_mmcif_category("_atom_site.").tags]
-    if len(set(given)) < len(given):
-        raise InputError(f"{path}: its _atom_site loop has a column twice; the file is damaged, fetch it again.")
-    missing = [tag for tag in _NEEDED if tag.lower() not in given]
-    if missing:
-        raise InputError(f"{path}: its _atom_site loop lacks {', '.join(sorted(t.lower() for t in missing))}.")
-    table = blocks[0].find("_atom_site.", [*_NEEDED, *(f"?{tag}" for tag in _OPTIONAL)])
-    models: list[str] = []
-    strand = ""
-    tags = [*_NEEDED, *_OPTIONAL]
-    column = tags.index("pdbx_PDB_model_num")
-    for number, row in enumerate(table, start=1):
-        model = row.str(column) if row.has(column) else "1"
-        if model not in models:
-            models.append(model)
-        if model != models[0]:
-            continue
-        item = {tag: row.str(k) for k, tag in enumerate(tags) if row.has(k) and row[k] not in ("?", ".")}
-        atom, where = _cif_atom(item, number, path)
-        if not atom.element:
-            found.unknown[len(found.atoms)] = where
-        strand, before = item.get("label_asym_id", ""), strand
-        if found.atoms and strand != before:
-            found.chain_ends.add(len(found.atoms) - 1)
-        found.atoms.append(atom)
-    if len(models) > 1:
-        found.notes.append(f"{len(models)} models in the file: the first is taken")
-    found.conect = sorted(_connections(blocks[0], found))
-    for row in blocks[0].find("_cell.", [f"length_{a}" for a in "abc"] + [f"angle_{a}" for a in _ANGLES]):
-        found.cell_nm = _cell([row.str(k) for k in range(6)])
-        break
-    return found
-
-
-def _cif_atom(item: dict[str, str], number: int, path: Path) -> tuple[AtomRecord, str]:
-    """Return the record, and what to say of it if its element stays unknown."""
-    position = coordinates([_UNCERTAINTY.sub("", item.get(f"Cartn_{axis}", "")) for axis in "xyz"])
-    if position is None:
-        raise InputError(f"{path}, atom row {number}: a coordinate is not a number; fetch or write the file again.")
     try:
-        occupancy = float(_UNCERTAINTY.sub("", item.get("occupancy", "1")))
-    except ValueError:
-        raise InputError(f"{path}, atom row {number}: the occupancy is not a number.") from None
-    name = item.get("auth_atom_id") or item.get("label_atom_id", "")
-    residue_name = item.get("auth_comp_id") or item.get("label_comp_id") or "UNL"
-    hetero = item.get("group_PDB") == "HETATM"
-    symbol = element_symbol(name, residue_name, item.get("type_symbol", ""), hetero=hetero) or ""
-    atom = AtomRecord(
-        name, symbol, residue_name, item.get("auth_asym_id") or item.get("label_asym_id", ""),
-        (item.get("auth_seq_id") or item.get("label_seq_id") or "1") + item.get("pdbx_PDB_ins_code", ""), position,
-        item.get("id") or str(number), item.get("label_alt_id", ""), occupancy, hetero,
-    )  # fmt: skip
-    return atom, f"{path}, atom row {number}: {name!r} has no recognisable element; fill type_symbol."
+        structure = gemmi.make_structure_from_block(blocks[0])
+    except RuntimeError:  # of tables whose tags do not go together
+        structure = gemmi.Structure()
+    models = list(structure)
+    if not models:
+        raise InputError(
+            f"{path}: its _atom_site loop is damaged, or lacks one of id, type_symbol, label_alt_id, label_asym_id and "
+            "Cartn_x, y, z; fetch or write the file again."
+        )
+    for things, of in (("structures", blocks), ("models", models)):
+        if len(of) > 1:
+            found.notes.append(f"{len(of)} {things} in the file: the first is taken")
+    rows = [(a, residue, chain.name) for chain in models[0] for residue in chain for a in residue]
+    rows.sort(key=lambda row: row[0].serial)  # gemmi joins what the file has of one residue
+    for k, (a, residue, chain) in enumerate(rows):
+        hetero, written = residue.het_flag == "H", "" if a.element.name == "X" else a.element.name
+        symbol = element_symbol(a.name, residue.name, written, hetero=hetero) or ""
+        place = residue.name or "UNL", chain, str(residue.seqid)
+        x, y, z = a.pos.tolist()
+        found.atoms.append(
+            AtomRecord(a.name, symbol, *place, (x, y, z), str(a.serial), a.altloc.strip("\0"), a.occ, hetero)
+        )
+        if k and residue.subchain != rows[k - 1][1].subchain:
+            found.chain_ends.add(k - 1)
+    _add_header(structure, found)
+    return found
 
 
 # ---- clean-up -------------------------------------------------------------------------------------------------------
@@ -460,7 +321,7 @@ _SAME_ANGSTROM = 0.0015
 _TELLING_NAMES = {"CA", "CH3", "CAY"}
 
 
-def _cleaned(found: StructureFile) -> StructureFile:
+def _cleaned(found: StructureFile, path: Path) -> StructureFile:
     """Return the file without atoms written twice, Drude particles and virtual sites, each said; residues that repeat
     under one number are told apart by their chains.
 
@@ -471,50 +332,48 @@ def _cleaned(found: StructureFile) -> StructureFile:
         found.notes.append(
             f"{len(gone)} atom{'s' if len(gone) > 1 else ''} written twice on one point: one of each left out"
         )
-    sites = _sites(found.atoms, set(found.unknown), gone)
+    sites = _sites(found.atoms, gone)
     if sites:
         names = listed(sorted({found.atoms[i].name for i in sites}))
         found.notes.append(f"{len(sites)} virtual sites and Drude particles left out: {names}")
     gone |= sites
-    for i, where in found.unknown.items():
-        if i not in gone:
-            raise InputError(where)
     found = found.without(gone)
+    for atom in found.atoms:
+        if not atom.element:
+            raise InputError(
+                f"{path}: atom {atom.serial} ({atom.label}) has no recognisable element; write it into columns 77-78 "
+                "(mmCIF: type_symbol)."
+            )
     found.atoms = _told_apart(found.atoms, found.chain_ends, found.notes)
     return found
 
 
 def _repeated(atoms: Sequence[AtomRecord]) -> set[int]:
     """Atoms of the same residue, name and position as one before."""
-    first: dict[tuple[object, ...], tuple[float, float, float]] = {}
+    first: dict[tuple[object, ...], AtomRecord] = {}
     out = set()
     for i, atom in enumerate(atoms):
-        key = (*atom.residue_key, atom.name, atom.altloc, atom.element)
-        here = atom.position_angstrom
-        if key not in first:
-            first[key] = here
-        elif max(abs(a - b) for a, b in zip(first[key], here, strict=True)) < _SAME_ANGSTROM:
+        before = first.setdefault((*atom.residue_key, atom.name, atom.altloc, atom.element), atom)
+        if before is not atom and distance_angstrom(before, atom) < _SAME_ANGSTROM:
             out.add(i)
     return out
 
 
-def _sites(atoms: Sequence[AtomRecord], unknown: set[int], gone: set[int]) -> set[int]:
+def _sites(atoms: Sequence[AtomRecord], gone: set[int]) -> set[int]:
     """Virtual sites, by their names where they have no element, else by a distance that no bond has; Drude particles,
     called D and the name of the atom they stand on."""
     found = set()
     for members in by_residue(atoms).values():
+        real = [j for j in members if atoms[j].element]
         for i in members:
-            name = atoms[i].name.upper()
-            may_be_drude = name.startswith("D") and i in unknown
-            if i in gone or not (may_be_drude or _SITE.fullmatch(name)):
+            name, is_unknown = atoms[i].name.upper(), not atoms[i].element
+            if is_unknown and name.startswith("D"):
+                others, reach = [j for j in real if name[1:] == atoms[j].name.upper()], _DRUDE_ANGSTROM
+            elif _SITE.fullmatch(name):
+                others, reach = [j for j in real if j != i], math.inf if is_unknown else _SITE_ANGSTROM
+            else:
                 continue
-            others = [j for j in members if j != i and j not in unknown]
-            if may_be_drude:
-                others = [j for j in others if name[1:] == atoms[j].name.upper()]
-            near = min((distance_angstrom(atoms[i], atoms[j]) for j in others), default=math.inf)
-            if near < (_DRUDE_ANGSTROM if may_be_drude else _SITE_ANGSTROM) or (
-                others and i in unknown and not may_be_drude
-            ):
+            if i not in gone and any(distance_angstrom(atoms[i], atoms[j]) < reach for j in others):
                 found.add(i)
     return found
 

@@ -23,7 +23,7 @@ N_COPIES = 400
 def copies(scene: Scene, n: int) -> Scene:
     """`n` independent particles in the well of a scene of one: its law acts on each."""
     law = dict(scene.interactions or {})
-    return particles("copies", law, np.repeat(scene.positions_nm, n, axis=0), masses_da=np.full(n, scene.masses_da[0]))
+    return particles("copies", law, np.repeat(scene.positions_nm, n, axis=0))
 
 
 def sampled(scene: Scene, temperature_k: float, *, n_frames: int, every_ps: float, discarded_ps: float) -> FloatArray:

@@ -134,7 +134,6 @@ _NUMBER = re.compile(r" *[-+]?[0-9]*\.?[0-9]*([eE][-+]?[0-9]+)? *\Z")
 
 
 _TELLING = re.compile("left out|models|added|taken|kept|hydrogens placed|dropped|standardi|renamed|replaced")
-_NO_ATOM = ("CRYST1", "REMARK")
 
 
 def atoms_of(data: bytes) -> list[tuple[float, float, float]] | None:
@@ -151,15 +150,7 @@ def atoms_of(data: bytes) -> list[tuple[float, float, float]] | None:
         elif line.startswith(("ATOM  ", "HETATM")) and not plain:
             if not ended:  # after END nothing is read, and what is there counts as lost
                 return None
-        elif (
-            line.startswith(("ATOM  ", "HETATM"))
-            or (
-                len(line) > 66  # whatever it calls itself, but for tables of numbers (Rosetta's energies)
-                and not line[27:30].strip()
-                and all(re.fullmatch(r" *-?[0-9]+\.[0-9]{3}", f) for f in fields)
-                and not line.startswith(_NO_ATOM)
-            )
-        ):
+        elif line.startswith(("ATOM  ", "HETATM")):
             found.append((float(fields[0]), float(fields[1]), float(fields[2])))
     return found
 

@@ -86,7 +86,7 @@ def test_another_law_is_another_system() -> None:
 @pytest.mark.parametrize(
     ("law", "said"),
     [
-        ({"kind": "magnetism"}, "unknown"),
+        ({"kind": "magnetism"}, "magnetism"),
         ({"kind": "harmonic", "force_constants_kj_mol_nm2": [1.0]}, "three"),
         ({"kind": "harmonic"}, "force_constants_kj_mol_nm2"),
         ({"kind": "harmonic", "force_constants_kj_mol_nm2": [1.0, 1.0, 1.0], "mass": 1.0}, "mass"),
@@ -94,5 +94,5 @@ def test_another_law_is_another_system() -> None:
 )
 def test_a_law_that_does_not_fit_is_refused_in_one_line(law: dict, said: str) -> None:
     with pytest.raises(InputError, match=said) as caught:
-        particles("x", law, np.zeros((2, 3)), masses_da=np.ones(2))
+        particles("x", law, np.zeros((2, 3)))
     assert "\n" not in str(caught.value)

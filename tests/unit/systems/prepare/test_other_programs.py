@@ -119,13 +119,6 @@ def test_bonds_between_residues_are_those_of_polymers_or_stated(tmp_path: Path) 
     assert (scene.n_atoms, "left out" in said(scene)) == (22, True)
 
 
-def test_a_peptide_bond_across_ter_is_noted(tmp_path: Path) -> None:
-    last = max(k for k, line in enumerate(ROWS) if line[17:20] == "ALA")
-    scene = read(tmp_path, [*ROWS[: last + 1], "TER", *ROWS[last + 1 :]])
-    assert said(scene) == "peptide bonds across the end of a chain (TER): ALA A2 - NME A3"
-    assert molecule_key(scene) == molecule_key(ALA2)
-
-
 def test_an_element_column_that_repeats_the_name_is_no_metal(tmp_path: Path) -> None:
     lines = [line[:76] + "CA" if line[12:16] == " CA " else line for line in ROWS]
     scene = read(tmp_path, lines)
@@ -202,8 +195,6 @@ def test_a_table_of_energies_after_the_atoms_is_no_atoms(tmp_path: Path) -> None
     rng = np.random.default_rng(0)
     table = [f"ALA_{k} " + " ".join(f"{x:.5g}" for x in rng.normal(0, 3, 20)) for k in range(200)]
     assert said(read(tmp_path, [*ROWS, "TER", "#BEGIN_POSE_ENERGIES_TABLE x.pdb", *table])) == ""
-    with pytest.raises(InputError, match="no record of the PDB format"):
-        read(tmp_path, [*ROWS[:3], "ATQM  " + ROWS[3][6:], *ROWS[4:]])
 
 
 @pytest.mark.parametrize(
@@ -224,3 +215,16 @@ def test_an_unusual_metal_is_no_reason_to_refuse_a_file(tmp_path: Path) -> None:
     path.write_text("\n".join([*lines[: ALA2.n_atoms + 1], "TER", tungsten, "END", ""]))
     scene = prepare(str(path))
     assert molecule_key(scene) == molecule_key(ALA2)
+
+
+@pytest.mark.parametrize("number", ["   1_0.50", "  \t0.500", "  ١.٥٠0 ", "  0x1p1 ", "        "])
+def test_numbers_of_other_notations_are_refused(tmp_path: Path, number: str) -> None:
+    line = ROWS[0][:30] + f"{number:8s}"[:8] + ROWS[0][38:]
+    with pytest.raises(InputError, match=r"line 1: columns 31-54"):
+        read(tmp_path, [line, *ROWS[1:]])
+
+
+def test_plain_notations_are_read(tmp_path: Path) -> None:
+    x = float(ROWS[0][30:38])
+    for text in (f"{x:8.3f}", f"{x:<8.3f}", f"{x:+8.3f}", f"{x:8.1e}"):
+        read(tmp_path, [ROWS[0][:30] + text + ROWS[0][38:], *ROWS[1:]])

@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from systems.chemistry.geometry import signed_volumes
-from systems.chemistry.graph import molecule_key
+from systems.chemistry.geometry import signed_volumes, torsion
+from systems.chemistry.graph import backbone_torsions, molecule_key
 from systems.errors import InputError, PreparationError
 from systems.library import named_scenes
 from systems.library.named_scenes import prepare
@@ -19,6 +19,7 @@ from systems.prepare.heterogens import ligand_atoms
 from systems.prepare.records import AtomRecord, standardise
 from systems.prepare.repair import _with_usual_lengths, complete, protonation_summary
 from systems.prepare.structure_text import decode, encode, read_structure
+from systems.scene import Scene
 from systems.trajectory.companion_writer import pdb_text
 
 ALA2 = named_scenes.load("alanine-dipeptide")
@@ -122,7 +123,7 @@ def test_a_missing_cb_is_built_l_whatever_psi(shared_data: Path) -> None:
     scene = prepare(str(shared_data / "hard-pdb" / "capping" / "nma.pdb"))  # PDBFixer alone makes this D-alanine
     index = {n: i for i, n in enumerate(scene.atom_names[:11])}
     heavy = {a: _record(a, "ALA", "1", *(scene.positions_nm[index[a]] * 10), a[0]) for a in ("N", "CA", "C", "CB")}
-    assert handedness([(("A", "1", "ALA"), "ALA", heavy)]) == {(("A", "1", "ALA"), "CA"): 1}
+    assert handedness([("ALA A1", "ALA", heavy)]) == {("ALA A1", "CA"): 1}
 
 
 def test_added_atoms_stand_at_their_usual_distances(tmp_path: Path) -> None:
@@ -160,14 +161,13 @@ def test_atoms_put_nowhere_near_theirs_are_refused() -> None:
 
 def test_inverted_centres_are_seen_said_and_refused() -> None:
     index = {n: i for i, n in enumerate(ALA2.atom_names) if ALA2.residue_of_atom[i] == 1}
-    key = ("", "2", "ALA")
 
     def at(mirror: float) -> dict[str, AtomRecord]:
         x = ALA2.positions_nm * [1, 1, mirror] * 10
         return {a: _record(a, "ALA", "2", *x[index[a]], a[0]) for a in ("N", "CA", "C", "CB")}
 
-    natural, inverted = (handedness([(key, "ALA", at(m))]) for m in (1.0, -1.0))
-    assert (natural, inverted) == ({(key, "CA"): 1}, {(key, "CA"): -1})
+    natural, inverted = (handedness([("ALA 2", "ALA", at(m))]) for m in (1.0, -1.0))
+    assert (natural, inverted) == ({("ALA 2", "CA"): 1}, {("ALA 2", "CA"): -1})
     notes: list[str] = []
     say_inverted(inverted, notes)
     assert notes == ["D-residues, as the file has them: ALA 2"]
@@ -255,10 +255,11 @@ def test_completion_never_turns_a_residue_over(monkeypatch: pytest.MonkeyPatch, 
 
 
 @pytest.mark.parametrize(
-    ("text", "named"), [("SdFS", "'d'"), ("ACE-D-ALA-NME", "'D-ALA'"), ("ACE-DAL-NME", "'DAL'")], ids=str
+    ("text", "said"),
+    [("SdFS", "a lower-case letter is a D-residue"), ("ACE-D-ALA-NME", "'D'"), ("ACE-DAL-NME", "'DAL'")],
 )
-def test_d_residues_in_sequences_are_refused_with_the_reason(text: str, named: str) -> None:
-    with pytest.raises(PreparationError, match=rf"{named} is a D-residue; sequences are built of L-residues alone"):
+def test_d_residues_in_sequences_are_refused(text: str, said: str) -> None:
+    with pytest.raises(PreparationError, match=said):
         prepare(f"sequence:{text}")
 
 
@@ -356,7 +357,53 @@ def test_a_hydrogen_at_anothers_methyl_is_a_clash(tmp_path: Path) -> None:
     x[moved] = beside + 0.1 * (beside - own) / np.linalg.norm(beside - own)
     path = tmp_path / "clash.pdb"
     path.write_text(pdb_text(ALA2.with_positions(x)))
-    with pytest.raises(PreparationError, match=r"NME A3 H1 and ACE A1 CH3 are 1\.00 Å apart.*the atoms clash"):
+    with pytest.raises(PreparationError, match=r"ACE A1 CH3 has 4 hydrogens \(.* and NME A3 H1\), 1 too many"):
         prepare(str(path))
     path.write_text(pdb_text(ALA2))
     assert prepare(str(path)).provenance["repairs"] == []
+
+
+# ---- breaks of the chain ---------------------------------------------------------------------------------------------
+
+
+def _without(scene: Scene, numbers: tuple[str, ...], folder: Path, *, hydrogens: bool = True) -> str:
+    lines = [
+        line
+        for line in pdb_text(scene).splitlines()
+        if line.startswith("ATOM") and line[22:26].strip() not in numbers and (hydrogens or line[76:78].strip() != "H")
+    ]
+    path = folder / "gap.pdb"
+    path.write_text("\n".join([*lines, "END"]))
+    return str(path)
+
+
+@pytest.mark.parametrize(("sequence", "hydrogens"), [
+    ("ACE-ALA-LYS-GLY-SER-ALA-GLU-NME", True), ("ACE-ALA-LYS-GLY-SER-ALA-GLU-NME", False),
+    ("AKGSPE", True), ("AKGSPE", False),
+])  # fmt: skip
+def test_a_break_is_closed_with_caps(tmp_path: Path, sequence: str, hydrogens: bool) -> None:
+    whole = prepare(f"sequence:{sequence}")
+    gone = ("4", "5") if sequence.startswith("ACE") else ("3", "4")
+    path = _without(whole, gone, tmp_path, hydrogens=hydrogens)
+    with pytest.raises(PreparationError, match=r"the chain breaks between .* \(C and N are .* Å apart\).*`cap_breaks"):
+        prepare(path)
+    scene = prepare(path, cap_breaks=True)
+    before, after = int(gone[0]) - 1, int(gone[-1]) + 1
+    names = list(zip(scene.residue_names, scene.residue_ids, strict=True))
+    assert ("NME", str(before + 1)) in names and ("ACE", str(after - 1)) in names
+    assert any(line.startswith("caps added where the chain breaks") for line in scene.provenance["repairs"])
+    heavy = {
+        (whole.residue_ids[whole.residue_of_atom[i]], whole.atom_names[i]): whole.positions_nm[i]
+        for i in whole.heavy_idx
+    }
+    kept = [
+        (scene.positions_nm[i], heavy[key])
+        for i in scene.heavy_idx
+        if (key := (scene.residue_ids[scene.residue_of_atom[i]], scene.atom_names[i])) in heavy and key[0] not in gone
+    ]
+    assert len(kept) > 20 and np.abs(np.array([a - b for a, b in kept])).max() < 1e-4
+    bonds = np.linalg.norm(scene.positions_nm[scene.bonds[:, 0]] - scene.positions_nm[scene.bonds[:, 1]], axis=1)
+    assert bonds.min() > 0.09 and bonds.max() < 0.16
+    omega = backbone_torsions(scene)["omega"]
+    assert (np.abs(torsion(scene.positions_nm, omega)) > np.radians(150)).all()
+    assert int(scene.formal_charges.sum()) == int(whole.formal_charges.sum())

@@ -46,26 +46,34 @@ def _pdb(path: Path, scene: Scene, numbers: tuple[float, ...] | None, *, heavy: 
 def _cif(path: Path, scene: Scene, numbers: tuple[float, ...]) -> str:
     tags = ["length_a", "length_b", "length_c", "angle_alpha", "angle_beta", "angle_gamma"]
     lines = ["data_x", *(f"_cell.{tag} {x}(2)" for tag, x in zip(tags, numbers, strict=True)), "loop_"]
-    columns = ("id", "type_symbol", "label_atom_id", "label_comp_id", "label_asym_id", "label_seq_id", "Cartn_x")
+    columns = (
+        "id",
+        "type_symbol",
+        "label_atom_id",
+        "label_comp_id",
+        "label_asym_id",
+        "label_seq_id",
+        "label_alt_id",
+        "Cartn_x",
+    )
     lines += [f"_atom_site.{tag}" for tag in (*columns, "Cartn_y", "Cartn_z")]
     for i, (x, y, z) in enumerate((10 * scene.positions_nm).round(3).tolist()):
         residue = int(scene.residue_of_atom[i])
         name = scene.residue_names[residue]
-        lines.append(f"{i + 1} {scene.elements[i]} {scene.atom_names[i]} {name} A {residue + 1} {x} {y} {z}")
+        lines.append(f"{i + 1} {scene.elements[i]} {scene.atom_names[i]} {name} A {residue + 1} . {x} {y} {z}")
     path.write_text("\n".join([*lines, ""]))
     return str(path)
 
 
-def _mol2(path: Path, scene: Scene, numbers: tuple[float, ...] | None) -> str:
+def _mol2(path: Path, scene: Scene) -> str:
     x = 10 * scene.positions_nm
     rows = [
         f"{i + 1} {scene.atom_names[i]} {x[i, 0]:.4f} {x[i, 1]:.4f} {x[i, 2]:.4f} {e} 1 LIG 0.0"
         for i, e in enumerate(scene.elements)
     ]
     bonds = [f"{k + 1} {i + 1} {j + 1} 1" for k, (i, j) in enumerate(scene.bonds.tolist())]
-    cell = ["@<TRIPOS>CRYSIN", " ".join(map(str, numbers)) + " 1 1"] if numbers else []
     head = ["@<TRIPOS>MOLECULE", "x", f"{len(rows)} {len(bonds)} 1", "SMALL", "NO_CHARGES", "", "@<TRIPOS>ATOM"]
-    path.write_text("\n".join([*head, *rows, "@<TRIPOS>BOND", *bonds, *cell, ""]))
+    path.write_text("\n".join([*head, *rows, "@<TRIPOS>BOND", *bonds, ""]))
     return str(path)
 
 
@@ -104,12 +112,9 @@ def test_heavy_atoms_are_made_whole_before_hydrogens_are_added(tmp_path: Path) -
 def test_molecules_without_templates_are_made_whole_too(tmp_path: Path) -> None:
     split = _wrapped(ETHANOL, CUBIC)
     assert _longest_nm(split) > 1.0
-    bare = replace(split, bonds=split.bonds[:0], bond_orders=split.bond_orders[:0])
-    files = [_mol2(tmp_path / f"{k}.mol2", each, CUBIC) for k, each in enumerate((split, bare))]
-    for path in (_pdb(tmp_path / "x.pdb", split, CUBIC), *files):
-        scene = prepare(path)
-        assert molecule_key(scene) == molecule_key(ETHANOL) and _longest_nm(scene) < 0.16
-        assert "made whole by the periodic cell" in _notes(scene)
+    scene = prepare(_pdb(tmp_path / "x.pdb", split, CUBIC))
+    assert molecule_key(scene) == molecule_key(ETHANOL) and _longest_nm(scene) < 0.16
+    assert "made whole by the periodic cell" in _notes(scene)
 
 
 def test_what_stays_broken_is_refused_with_its_bond_and_length(tmp_path: Path) -> None:
@@ -120,7 +125,7 @@ def test_what_stays_broken_is_refused_with_its_bond_and_length(tmp_path: Path) -
         _pdb(tmp_path / "wrong.pdb", peptide, (31.0, 31.0, 31.0, 90.0, 90.0, 90.0)),
         _pdb(tmp_path / "heavy.pdb", peptide, None, heavy=True),
         _pdb(tmp_path / "conect.pdb", molecule, None),
-        _mol2(tmp_path / "none.mol2", molecule, None),
+        _mol2(tmp_path / "none.mol2", molecule),
     ]
     for path in files:
         with pytest.raises(SurromdError, match=r"the bond .* - .* is \d+\.\d\d Å long.*make it whole") as caught:
