@@ -27,23 +27,15 @@ def parse_sequence(text: str) -> list[str]:
     A single known three-letter name is one residue. Raises PreparationError for unknown residues and misplaced caps.
     """
     allowed = [*amino_acid_names(), *_PROTONATED, "ACE", "NME"]
-    word = text.strip().upper()
-    if not word:
-        raise PreparationError("The sequence is empty; write it like sequence:ACE-ALA-NME or sequence:SDFS.")
-    names = [n.strip() for n in word.split("-")] if "-" in word or word in allowed else None
-    if names is None:
-        if not (text.strip().isupper() or text.strip().islower()):
-            raise PreparationError(
-                f"Sequence {text!r} mixes cases: a lower-case letter is a D-residue, and sequences are built of "
-                "L-residues alone; write capitals, or give a PDB file or a SMILES string."
-            )
-        unknown = sorted({c for c in word if c not in ONE_LETTER})
-        if unknown:
-            raise PreparationError(
-                f"Sequence {text!r}: {', '.join(map(repr, unknown))} is no one-letter amino acid; "
-                "write three-letter names with dashes, as in ACE-ALA-NME."
-            )
-        names = [ONE_LETTER[c] for c in word]
+    written = text.strip()
+    word = written.upper()
+    is_named = "-" in word or word in allowed
+    if not is_named and not (written.isupper() or written.islower()):
+        raise PreparationError(
+            f"Sequence {text!r}: write capitals, as in SDFS, or names with dashes, as in ACE-ALA-NME; a lower-case "
+            "letter among them is a D-residue, which needs a PDB file or a SMILES string."
+        )
+    names = [n.strip() for n in word.split("-")] if is_named else [ONE_LETTER.get(c, c) for c in word]
     names = ["NME" if n == "NMA" else n for n in names]
     for k, name in enumerate(names):
         if name not in allowed:

@@ -47,20 +47,16 @@ def _pdb(
     write_element: bool = True,
     first_serial: int = 1,
     extra: str = "",
-    altloc: Sequence[str] | None = None,
-    occupancy: Sequence[float] | None = None,
 ) -> Path:
     lines = []
     order = range(len(names)) if order is None else order
     for k, i in enumerate(order):
         name = names[i] if len(names[i]) == 4 else f" {names[i]}"
         x, y, z = positions_nm[i] * 10
-        alt = altloc[i] if altloc else " "
-        occ = occupancy[i] if occupancy else 1.0
         element = elements[i] if write_element else ""
         lines.append(
-            f"ATOM  {first_serial + 3 * k:5d} {name:<4s}{alt}{residues[i]:>3s}  {numbers[i]:4d}    "
-            f"{x:8.3f}{y:8.3f}{z:8.3f}{occ:6.2f}  0.00          {element:>2s}"
+            f"ATOM  {first_serial + 3 * k:5d} {name:<4s} {residues[i]:>3s}  {numbers[i]:4d}    "
+            f"{x:8.3f}{y:8.3f}{z:8.3f}  1.00  0.00          {element:>2s}"
         )
     path.write_text("\n".join(lines) + f"\n{extra}END\n")
     return path
@@ -219,24 +215,6 @@ def test_shuffled_residues_are_repaired_in_chain_order(tmp_path: Path) -> None:
     scene = prepare(str(_pdb(tmp_path / "x.pdb", order=heavy)))
     assert scene.residue_names == ("ACE", "ALA", "NME")
     assert molecule_key(scene) == molecule_key(ALA2)
-
-
-def test_alternate_locations_keep_the_most_occupied(tmp_path: Path) -> None:
-    names = [*ALA2.atom_names, "HB1", "HB2", "HB3"]
-    methyl = ALA2.positions_nm[[12, 13, 11]] + 0.004
-    positions = np.concatenate([ALA2.positions_nm, methyl])
-    alt = [*("A" if i in (11, 12, 13) else " " for i in range(22)), "B", "B", "B"]
-    for share, expected in ((0.6, ALA2.positions_nm[11]), (0.4, methyl[0])):
-        occupancy = [*(share if a == "A" else 1.0 for a in alt[:22]), *[1 - share] * 3]
-        path = _pdb(
-            tmp_path / "x.pdb", positions, names=names, elements=[*ALA2.elements, "H", "H", "H"],
-            residues=[*RESIDUES, *["ALA"] * 3], numbers=[*NUMBERS, 2, 2, 2], altloc=alt, occupancy=occupancy,
-        )  # fmt: skip
-        scene = prepare(str(path))
-        assert scene.n_atoms == 22
-        first = next(i for i, n in enumerate(scene.atom_names) if n == "HB1")
-        assert scene.positions_nm[first] == pytest.approx(expected, abs=1e-4)
-        assert "alternate locations in 1 residues" in scene.provenance["repairs"][0]
 
 
 def test_first_model_is_taken_and_water_left_out(tmp_path: Path) -> None:

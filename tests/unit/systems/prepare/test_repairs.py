@@ -256,7 +256,7 @@ def test_completion_never_turns_a_residue_over(monkeypatch: pytest.MonkeyPatch, 
 
 @pytest.mark.parametrize(
     ("text", "said"),
-    [("SdFS", "a lower-case letter is a D-residue"), ("ACE-D-ALA-NME", "'D'"), ("ACE-DAL-NME", "'DAL'")],
+    [("SdFS", "a lower-case letter among them is a D-residue"), ("ACE-D-ALA-NME", "'D'"), ("ACE-DAL-NME", "'DAL'")],
 )
 def test_d_residues_in_sequences_are_refused(text: str, said: str) -> None:
     with pytest.raises(PreparationError, match=said):

@@ -54,7 +54,7 @@ def test_sequence_text_is_parsed_or_refused_in_one_line() -> None:
         ("ACE-ALX-NME", "unknown residue 'ALX'"),
         ("SDBS", "'B'"),
         ("ALA-ACE-ALA", "alone or inside"),
-        ("", "empty"),
+        ("", "write capitals"),
         ("ACE", "alone or inside"),
         ("A" * 500, "up to 200"),
         ("ALA--ALA", "unknown residue ''"),
