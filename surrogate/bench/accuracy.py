@@ -1,27 +1,25 @@
 """Errors of one rollout against held-out reference, with error bars, its equivalent MD time, and effective samples.
 
 Effective samples are simulated time over 2 max(τ_model, τ_MD), τ the relaxation time of the slowest torsion of which
-the MD at hand holds at least 50: a model that forgets too fast earns nothing by it, and one that forgets too slowly
-pays for it. What they say nothing about is whether the samples are right; that is the distance beside them.
+the MD at hand holds at least 50: a model that forgets too fast gains nothing by it, and one that forgets too slowly
+loses. They say nothing of whether the samples are right; that is the distance beside them.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from surrogate.bench.stress_page import HALF_ANGSTROM_RULE, Frames, measure_bonds
-from surrogate.bench.timing import SIMD
+from surrogate.bench.timing import SIMD, Frames
 from surrogate.comparison.equivalent_time import (
     EquivalentTime,
     distance_to_reference,
     equivalent_time_by,
-    errors_by_length,
     joint_measure,
 )
 from surrogate.comparison.measure.distributions import block_occupancy
@@ -31,17 +29,17 @@ from surrogate.comparison.measure.structure import Baseline, Features, backbone
 from surrogate.comparison.read.ensemble import Ensemble, load_ensemble
 from surrogate.comparison.rows.kinetics_rows import relaxation_of, turning
 from surrogate.comparison.rows.rows import Options, Sample, make_sample
-from systems.chemistry.validity import BOND_20_PERCENT, INVALID, NOT_FINITE
+from systems.chemistry.validity import BOND_20_PERCENT, BOND_HALF_ANGSTROM, NOT_FINITE
 from systems.errors import InputError
 from systems.scene import Scene
+from systems.units import format_time_ps
 
 if TYPE_CHECKING:
     from surrogate.models.weights import Weights
 
 CHECKS = {
-    "valid_half_angstrom_%": HALF_ANGSTROM_RULE,
+    "valid_half_angstrom_%": NOT_FINITE | BOND_HALF_ANGSTROM,
     "bonds_20_percent_%": NOT_FINITE | BOND_20_PERCENT,
-    "valid_all_%": INVALID,
 }
 # Below so many effective samples of MD, nobody knows its relaxation time.
 LEAST_SAMPLES = 50.0
@@ -82,10 +80,9 @@ def compare_frames(
     φ/ψ map.
 
     `jsd`: Jensen-Shannon distance of the joint φ/ψ histograms (50 x 50, overflow bins), the root mean square of those
-    to the two held-out runs; `curve`: the same of parts of the rollout, (ps, distance); shares of valid frames; the
-    autocorrelation of cos ψ after one frame and its relaxation time; bonds (`measure_bonds`). Numbers with intervals
-    are dictionaries of `comparison.statistics.Estimate`. `slow_relaxation_ps`: of the torsion `slowest`, where one is
-    named (`slowest_torsion`). Raises InputError where frames are too few.
+    to the two held-out runs; shares of valid frames; the autocorrelation of cos ψ after one frame and its relaxation
+    time. Numbers with intervals are dictionaries of `comparison.statistics.Estimate`. `slow_relaxation_ps`: of the
+    torsion `slowest`, where one is named (`slowest_torsion`). Raises InputError where frames are too few.
     """
     rolled = Ensemble("rollout", [x.astype(np.float32) for x in frames], ref.reference.lag_ps, ref.scene)
     features = ref.baseline.measure(rolled)
@@ -97,10 +94,8 @@ def compare_frames(
     correlation, relaxation = relaxation_of(sample)
     out: dict[str, Any] = {
         "jsd": distance_to_reference(found[0], seed).to_dict(),
-        "curve": np.stack(errors_by_length(found[0], features.total_ps), axis=1).tolist(),
         "correlation": correlation.to_dict(),
         "relaxation_ps": relaxation.to_dict(),
-        **measure_bonds(np.concatenate(list(frames)), ref.baseline.geometry),
     }
     if slowest is not None:
         out["slow_relaxation_ps"] = relaxation_of(sample, slowest)[1].to_dict()
@@ -134,21 +129,17 @@ def compare_reference(ref: HeldOut, *, seed: int = 0) -> dict[str, Any]:
 
 
 def equivalent_time_row(equivalent_time: EquivalentTime, spent_s: float, md_s_per_ns: float) -> dict[str, Any]:
-    """Return how much MD a rollout is worth; what so much MD takes, over `spent_s` (`times_faster`, with the ends of
-    its interval); and the error of as many seconds of MD. Nothing is claimed beyond the longest MD at hand."""
-    found = asdict(equivalent_time)
-    ends = {"": "equivalent_ps", "_low": "low_ps", "_high": "high_ps"}
-    share = 1e3 * spent_s / md_s_per_ns / equivalent_time.lengths_ps[-1]
-    is_known = share >= equivalent_time.lengths_ps[0] / equivalent_time.lengths_ps[-1]
-    return {
-        "equivalent_time": {key: found[key] for key in (*ends.values(), "bound")}
-        | {"words": equivalent_time.in_words()},
-        **{
-            f"times_faster{end}": None if found[key] is None else 1e-3 * found[key] * md_s_per_ns / spent_s
-            for end, key in ends.items()
-        },
-        "md_of_same_seconds": equivalent_time.error_at(share) if is_known else None,
-    }
+    """Return the equivalent MD time of a rollout; what so much MD takes, over `spent_s` (`times_faster`, with the ends
+    of its interval); and the error of as many seconds of MD, None where that is shorter than any MD at hand."""
+    row: dict[str, Any] = {"equivalent_time": {"words": equivalent_time.in_words(), "bound": equivalent_time.bound}}
+    for end, name in (("", "equivalent_ps"), ("_low", "low_ps"), ("_high", "high_ps")):
+        time_ps = getattr(equivalent_time, name)
+        row["equivalent_time"][name] = time_ps
+        row[f"times_faster{end}"] = None if time_ps is None else 1e-3 * time_ps * md_s_per_ns / spent_s
+    md_ps = 1e3 * spent_s / md_s_per_ns
+    is_at_hand = md_ps >= equivalent_time.lengths_ps[0]
+    row["md_of_same_seconds"] = equivalent_time.error_at(md_ps / equivalent_time.lengths_ps[-1]) if is_at_hand else None
+    return row
 
 
 def _sample(features: Features, ref: HeldOut, seed: int) -> Sample:
@@ -171,8 +162,8 @@ def slowest_torsion(samples: Sequence[Sample]) -> dict[str, Any] | None:
             tau_ps = sum(times) / len(times)
             name = f"cos {symbol or label}".strip()
             found.append({"torsion": k, "name": name, "tau_ps": tau_ps, "samples": total_ps / (2.0 * tau_ps)})
-    known = [one for one in found if one["samples"] >= LEAST_SAMPLES]
-    return max(known, key=lambda one: float(one["tau_ps"])) if known else None
+    enough = [one for one in found if one["samples"] >= LEAST_SAMPLES]
+    return max(enough, key=lambda one: float(one["tau_ps"])) if enough else None
 
 
 def samples_per_second(cpu_s_per_ns: float, tau_ps: float | None, md_tau_ps: float) -> float | None:
@@ -182,57 +173,67 @@ def samples_per_second(cpu_s_per_ns: float, tau_ps: float | None, md_tau_ps: flo
     return 1e3 / cpu_s_per_ns / (2.0 * max(tau_ps, md_tau_ps))
 
 
-def fastest_openmm(md: dict[str, Any]) -> float:
-    """Return the processor seconds of a ns of OpenMM at its fastest."""
-    return min(float(cost["cpu_s_per_ns"]["mean"]) for cost in md["cost"] if cost["way"] != SIMD)
-
-
-def effective_row(row: dict[str, Any], tau_ps: float | None, md: dict[str, Any]) -> dict[str, Any]:
-    """Return what a measured setting earns: its effective samples a second, and these over those of OpenMM at its
-    fastest."""
+def effective_row(row: dict[str, Any], md: dict[str, Any]) -> dict[str, Any]:
+    """Return the effective samples a second of a setting that was rolled (`row`), and these over those of OpenMM."""
     slow = md.get("slowest")
-    if slow is None:
+    if slow is None or "slow_relaxation_ps" not in row:
         return {}
-    rate = samples_per_second(row["cpu_s_per_ns"]["mean"], tau_ps, slow["tau_ps"])
-    best = 1e3 / fastest_openmm(md) / (2.0 * slow["tau_ps"])
-    over_md = None if rate is None else rate / best
-    return {"slow_tau_ps": tau_ps, "effective_per_s": rate, "effective_over_md": over_md}
+    rate = samples_per_second(row["cpu_s_per_ns"]["mean"], row["slow_relaxation_ps"]["value"], slow["tau_ps"])
+    md_s_per_ns = next(cost["cpu_s_per_ns"]["mean"] for cost in md["cost"] if cost["way"] != SIMD)
+    over_md = None if rate is None else rate * md_s_per_ns * 2e-3 * slow["tau_ps"]
+    return {"effective_per_s": rate, "effective_over_md": over_md}
 
 
-def pareto_front(points: Sequence[tuple[float, float]]) -> list[int]:
-    """Return the places of points (effective samples a second, distance) that no other point beats in both, the fastest
-    first."""
-    order = sorted(range(len(points)), key=lambda k: (-points[k][0], points[k][1]))
-    front: list[int] = []
-    for k in order:
-        if not front or points[k][1] < points[front[-1]][1]:
-            front.append(k)
-    return front
+# ---- held-out reference ---------------------------------------------------------------------------------------------
 
 
-def training_cost(weights: Weights, md_s_per_ns: float) -> dict[str, float | None]:
-    """Return what weights took before their first frame, JSON-able: `training_s` of all trainings that they come from,
-    as their provenance has them, and `reference_s`, what MD here takes for the frames that these saw."""
-    seconds, known, frames = 0.0, False, dict[str, int]()
-    record: Any = weights.provenance
-    while isinstance(record, dict):
-        for key in ("stage_one_s", "stage_two_s", "spent_s", "training_s"):
-            if isinstance(record.get(key), int | float):
-                seconds, known = seconds + float(record[key]), True
-        for source in record.get("sources", ()):
-            frames[str(source.get("sha256"))] = int(source.get("n_frames", 0))
-        record = record.get("from")
-    simulated_ns = 1e-3 * sum(frames.values()) * weights.domain.lag_ps
-    return {
-        "training_s": seconds if known else None,
-        "reference_ns": simulated_ns,
-        "reference_s": simulated_ns * md_s_per_ns,
-    }
+def refuse_trained_on(
+    weights: Weights, reference: Sequence[Path], replicate: Sequence[Path], *, lag_ps: float | None = None
+) -> list[str]:
+    """Raise InputError unless weights never saw these trajectories; return the fingerprints of their frames.
+
+    Refused are: frames named in the provenance of the weights, of those they began from and so on; a run of the
+    same conditions and seed as one of these (a part of it, or saved otherwise); conditions other than those of
+    training; an interval between the frames that are compared (`lag_ps`, or all) that the weights do not step to; and
+    motion that reference and replicate have in common (`data.frames.refuse_leaks`).
+    """
+    from surrogate.data import collect_frames
+
+    domain, name = weights.domain, weights.path.name
+    canonical = getattr(weights.model.config, "canonical", True)
+    frames = collect_frames(list(reference), canonical=canonical, held=list(replicate))
+    try:
+        frames.refuse_leaks()
+    except InputError as error:
+        raise InputError(f"reference and replicate must be runs of their own, and share motion: {error}") from error
+    for key, value in frames.conditions.items():
+        if value != domain.conditions.get(key):
+            raise InputError(
+                f"{reference[0]} has {key} {value}, {name} was trained for {domain.conditions.get(key)}: no reference "
+                "to compare it with."
+            )
+    compared_ps = lag_ps or frames.lag_ps
+    for step_ps, what in ((frames.lag_ps, f"frames of {reference[0]}"), (domain.lag_ps, f"steps of {name}")):
+        if round(compared_ps / step_ps) < 1 or abs(compared_ps / step_ps - round(compared_ps / step_ps)) > 1e-6:
+            raise InputError(
+                f"frames {format_time_ps(compared_ps)} apart cannot be compared: {what} are "
+                f"{format_time_ps(step_ps)} apart; give `lag_ps` as a multiple of both, or other references."
+            )
+    trained = list(_sources(weights.provenance))
+    for path, source in zip([*reference, *replicate], frames.sources, strict=True):
+        for other in trained:
+            same_frames = other.get("sha256") == source["sha256"]
+            same_run = not domain.further and source["seed"] is not None and other.get("seed") == source["seed"]
+            if same_frames or same_run:
+                raise InputError(
+                    f"{path}: {name} was trained on this run (seed {other.get('seed')}, then called "
+                    f"{other.get('file')}); give runs that training never saw."
+                )
+    return [str(source["sha256"]) for source in frames.sources]
 
 
-def break_even(spent_s: float, rate: float | None, md_rate: float) -> float | None:
-    """Return after how many effective samples a surrogate that took `spent_s` before its first has cost as much as MD;
-    None where it never does."""
-    if rate is None or rate <= md_rate:
-        return None
-    return spent_s / (1.0 / md_rate - 1.0 / rate)
+def _sources(provenance: dict[str, Any]) -> Iterator[dict[str, Any]]:
+    """All trajectories of a training and of those that it began from."""
+    yield from provenance.get("sources", ())
+    if isinstance(provenance.get("from"), dict):
+        yield from _sources(provenance["from"])

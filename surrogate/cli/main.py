@@ -17,7 +17,6 @@ import typer
 from typer.core import TyperGroup
 
 import surrogate as sm
-from surrogate.bench.bench_options import CostErrorOptions, StressOptions
 from surrogate.cli.parameters import JsonOpt, OutOpt, SceneArg, WeightsOpt, literal, usage_error, with_options
 from surrogate.cli.render import (
     as_flags,
@@ -31,12 +30,14 @@ from surrogate.cli.render import (
 from surrogate.verbs.options import (
     CampaignOptions,
     CompareOptions,
+    CostErrorOptions,
     DemoOptions,
     PlanOptions,
     Quiet,
     ReferenceOptions,
     RolloutOptions,
     RunOptions,
+    StressOptions,
     TrainOptions,
     WindowsOptions,
     said,
@@ -348,13 +349,10 @@ def cost_error(
 
     REFERENCE and REPLICATE: two runs that the weights were not trained on.
     """
-    from surrogate.bench.cost_error import cost_error as run
-    from surrogate.bench.cost_page import markdown
+    from surrogate.bench import cost_error as bench
 
-    report = _reporting(options.quiet or as_json)
-    result = run(reference, replicate, weights, out, options, report=report)
-    files = f"{out}: cost_error.json, cost_error.md, cost_error.svg"
-    _print_tables(result, markdown, files, as_json=as_json, quiet=options.quiet)
+    result = bench.cost_error(reference, replicate, weights, out, options, report=_reporting(options.quiet or as_json))
+    _print_tables(result, bench.markdown, f"{out}: cost_error.json, .md and .svg", as_json, options.quiet)
 
 
 @app.command()
@@ -366,20 +364,18 @@ def stress(
     options: StressOptions,
     as_json: JsonOpt = False,
 ) -> None:
-    """Stress-test WEIGHTS: long rollouts, unusual inputs, precision, solvers, beside OpenMM."""
-    from surrogate.bench.stress import choose_config, stress_weights
-    from surrogate.bench.stress_page import markdown
+    """Stress-test WEIGHTS: long rollouts, unusual inputs, precision, beside OpenMM."""
+    from surrogate.bench import stress as bench
 
-    report = _reporting(options.quiet or as_json)
-    result = stress_weights(weights, out, choose_config(options), scene=options.scene, report=report)
-    _print_tables(result, markdown, f"{out}: stress.json, stress.md", as_json=as_json, quiet=options.quiet)
+    result = bench.stress(weights, out, options, report=_reporting(options.quiet or as_json))
+    _print_tables(result, bench.markdown, f"{out}: stress.json, stress.md", as_json, options.quiet)
 
 
 def _reporting(quiet: bool) -> Callable[[str], None]:
     return lambda line: None if quiet else typer.echo(f"running: {line}", err=True)
 
 
-def _print_tables(result: Any, markdown: Callable[[Any], str], files: str, *, as_json: bool, quiet: bool) -> None:
+def _print_tables(result: Any, markdown: Callable[[Any], str], files: str, as_json: bool, quiet: bool) -> None:
     """Print what a benchmark has found, and which files it has written."""
     if as_json:
         print_json(result)

@@ -11,8 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import typer
 
-from surrogate.bench.bench_options import CostErrorOptions, StressOptions
-from surrogate.verbs.options import VERB_OPTIONS
+from surrogate.verbs.options import VERB_OPTIONS, CostErrorOptions, StressOptions
 from systems.files.outside import printable
 from systems.options import Option, options_of
 

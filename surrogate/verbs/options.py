@@ -12,7 +12,7 @@ from typing import Any
 
 from md_reference.forces.spec import ForceFieldSpec, WaterBox
 from md_reference.run.config import MDConfig
-from surrogate.sampling.config import RolloutConfig
+from surrogate.sampling.config import GUARDS, RolloutConfig
 from systems.options import Preparation, from_field, option
 from systems.units import Quantity, parse_time_ps
 
@@ -202,6 +202,65 @@ class RunOptions(MDSettings, Preparation, OnDask, Seeded, Resuming, Overwriting,
     format: str = option("Trajectory format.", "h5", choices=("h5", "dcd", "xtc"))
     cores: int | None = option("Maximum number of CPU cores.", None, within=(1, None), unset="all")
     dry_run: bool = option("Print the timings and the decision without running.", False)
+
+
+@dataclass(frozen=True, kw_only=True)
+class CostErrorConfig:
+    """What is the same for all settings. Rolled are `time_ps` in all replicas together, in `rounds` parts, after
+    `discarded_ps` of each replica that count in neither cost nor error; MD runs `slice_ps` before each part."""
+
+    time_ps: float = option("Rollout time per setting, all replicas together.", 20_000.0, within=(1.0, None))
+    discarded_ps: float = option("Time left out at the start of each replica.", 100.0, within=(0.0, None), words=None)
+    rounds: int = option("Number of blocks, alternating with OpenMM.", 4, within=(1, None))
+    slice_ps: float = option("Length of MD before each block.", 40.0, within=(0.01, None), words=None)
+    lag_ps: float | None = option(
+        "Interval between compared frames.", None, within=(1e-6, None), unset="as in the references"
+    )
+    threads: int = option("Number of threads of both.", 1, within=(1, None), words=None)
+    seed: int = option("Random seed.", 0, within=(0, None))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Sweep:
+    """The settings of a benchmark: all combinations of what is given."""
+
+    solvers: Sequence[str] | None = option(
+        "Solver to try; repeatable.", None, words=("solver",), unset="all of a fixed number of steps"
+    )
+    steps: Sequence[int] = option("Solver steps to try; repeatable.", (2, 3, 4, 6, 10, 20), within=(1, None))
+    precisions: Sequence[str] = option(
+        "Precision to try; repeatable.", ("auto",), choices=("auto", "fp32", "bf16"), words=("precision",)
+    )
+    batches: Sequence[int] = option("Number of replicas to try; repeatable.", (32,), within=(1, None), words=("batch",))
+    compiled: bool = option("Also time the compiled network.", False, words=("compile",))
+
+
+@dataclass(frozen=True, kw_only=True)
+class CostErrorOptions(CostErrorConfig, Sweep, Quiet):
+    """Options of `bench cost-error`: what is the same for all settings, and which settings."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class StressOptions(Seeded, Quiet):
+    """Options of `stress`."""
+
+    frames: Sequence[int] | None = option(
+        "Rollout length in frames, all replicas together; repeatable.", None, within=(1, None), unset="10000 and 100000"
+    )
+    replicas: int | None = option("Number of rollout replicas.", None, within=(1, None), unset="16")
+    guards: Sequence[str] = option(
+        "Guard policy of the rollouts; repeatable.", ("flag", "repair"), choices=GUARDS, words=("guard",)
+    )
+    sections: Sequence[str] = option(
+        "Test to run; repeatable.",
+        ("length", "inputs", "precision", "openmm"),
+        choices=("length", "inputs", "precision", "openmm"),
+        words=("section",),
+    )
+    scene: str | None = option(
+        "Scene to test, for weights of several peptides, such as sequence:ACE-LEU-SER-NME.", None
+    )
+    quick: bool = option("Short runs: a minute or two.", False)
 
 
 # By the verb's name in Python.

@@ -72,13 +72,11 @@ def test_an_unseen_molecule_rolls_at_the_lag_that_is_kept(folder: Path) -> None:
 
 
 def test_stress_takes_the_molecule_to_try(folder: Path) -> None:
-    common = ["stress", str(folder / "w.safetensors"), "-o", str(folder / "stress"), "--section", "invariance"]
+    common = ["stress", str(folder / "w.safetensors"), "-o", str(folder / "stress"), "--section", "openmm", "--quick"]
     done = run(*common, "--scene", "sequence:ACE-SER-ALA-NME", "--json")
     assert done.exit_code == 0, done.stderr
     found = json.loads(done.stdout)
-    assert (
-        found["scene"] == "ACE-SER-ALA-NME" and max(r["deviation_nm"] for r in found["sections"]["invariance"]) < 1e-5
-    )
+    assert found["scene"] == "ACE-SER-ALA-NME" and list(found["sections"]) == ["openmm"]
     first = json.loads(run(*common, "--json").stdout)
     assert first["scene"] == "ACE-ALA-SER-NME"
     for text, why in (("sequence:ACE-GLY-NME", "residues"), ("smiles:C((", "smiles")):

@@ -5,30 +5,27 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 
 from md_reference.run.engine import Engine
-from surrogate.bench.bench_options import StressOptions
 from surrogate.bench.stress import (
-    StressConfig,
-    choose_config,
-    measure_batches,
-    measure_invariance,
+    markdown,
+    measure_bonds,
+    measure_drift,
     measure_odd_inputs,
     measure_openmm,
     measure_precision,
-    openmm_of,
+    measure_validity,
     run_stress,
 )
-from surrogate.bench.stress_page import markdown, measure_bonds, measure_drift, measure_validity
+from surrogate.bench.timing import openmm_of
 from surrogate.models.weights import Weights
-from systems.chemistry.graph import molecule_key
+from surrogate.verbs.options import StressOptions
 from systems.chemistry.validity import Geometry, geometry_from_frames
 from systems.errors import InputError
-from systems.scene import Scene, reordered
+from systems.scene import Scene
 
 
 @pytest.fixture(scope="module")
@@ -43,16 +40,14 @@ def geometry(alanine_dipeptide: Scene, vibrating: np.ndarray) -> Geometry:
     return geometry_from_frames(alanine_dipeptide, vibrating.reshape(-1, 22, 3))
 
 
-def test_broken_frames_are_counted_and_dated(vibrating: np.ndarray, geometry: Geometry) -> None:
-    whole = measure_validity(list(vibrating), geometry, 2.0)
-    assert (whole.frames, whole.broken, whole.first_broken_ps) == (800, 0, None)
+def test_broken_frames_are_counted(vibrating: np.ndarray, geometry: Geometry) -> None:
+    assert measure_validity(list(vibrating), geometry) == {"valid_half_angstrom_%": 100.0, "valid_all_%": 100.0}
     broken = vibrating.copy()
     broken[1, 49, 0] += 0.3
     broken[1, 120:, 0] += 0.3
     broken[3, 9] = np.nan
-    found = measure_validity(list(broken), geometry, 2.0)
-    assert (found.broken, found.invalid, found.first_broken_ps) == (82, 82, 20.0)
-    assert found.to_dict()["valid_half_angstrom_%"] == pytest.approx(100 * (1 - 82 / 800))
+    found = measure_validity(list(broken), geometry)
+    assert list(found.values()) == pytest.approx([100 * (1 - 82 / 800)] * 2)
 
 
 def test_bonds_tell_length_and_temperature(vibrating: np.ndarray, geometry: Geometry, alanine_dipeptide: Scene) -> None:
@@ -70,25 +65,13 @@ def test_drift_between_first_and_last_tenth(
     vibrating: np.ndarray, geometry: Geometry, alanine_dipeptide: Scene
 ) -> None:
     still = measure_drift(list(vibrating), alanine_dipeptide, geometry)
-    assert abs(still["first"]["bond_variance_%"] - still["last"]["bond_variance_%"]) < 25.0
+    assert abs(still["first_bond_variance_%"] - still["last_bond_variance_%"]) < 25.0
     drifting = vibrating.copy()
     drifting[:, 150:, 14:] += [0.0, 0.06, 0.06]  # all atoms from C of ALA on
     moved = measure_drift(list(drifting), alanine_dipeptide, geometry)
-    assert moved["last"]["bond_shift_pm"] > 5.0 > moved["first"]["bond_shift_pm"]
-    assert moved["torsion_jsd"] > 3.0 * moved["torsion_jsd_floor"]
-    assert still["torsion_jsd"] < 2.0 * still["torsion_jsd_floor"]
-
-
-def test_moved_and_permuted_input_gives_the_moved_chunk(small_weights: Weights) -> None:
-    rows = {row["input"]: row for row in measure_invariance(small_weights, precision="fp32")}
-    assert len(rows) == 5 and rows["translated by 10 nm"]["deviation_nm"] > 0.0
-    for name, row in rows.items():
-        assert row["deviation_nm"] < (5e-6 if "1e+06" in name else 1e-6), name
-    scene = small_weights.domain.scene
-    order = np.random.default_rng(1).permutation(22)
-    other = reordered(scene, order)
-    assert [other.elements[k] for k in range(22)] == [scene.elements[i] for i in order]
-    assert molecule_key(other) == molecule_key(scene)
+    assert moved["last_bond_shift_pm"] > 5.0 > moved["first_bond_shift_pm"]
+    assert moved["torsion_distance"] > 3.0 * moved["torsion_distance_by_chance"]
+    assert still["torsion_distance"] < 2.0 * still["torsion_distance_by_chance"]
 
 
 def test_odd_inputs_are_refused_with_their_reason(small_weights: Weights) -> None:
@@ -101,39 +84,27 @@ def test_odd_inputs_are_refused_with_their_reason(small_weights: Weights) -> Non
     assert "start" in rows["clashing: two far atoms 0.02 nm apart"]["reasons"]
 
 
-def test_arithmetic_and_batches(small_weights: Weights) -> None:
-    rows = {row["arithmetic"]: row for row in measure_precision(small_weights, compiled=False)}
-    assert 1e-9 < rows["fp32"]["deviation_nm"] < 1e-4 < 50 * rows["bf16"]["deviation_nm"]
-    assert rows["bf16"]["rms_nm"] > 20 * rows["fp32"]["rms_nm"], "bf16 must not be float32 by another name"
-    one, four = measure_batches(small_weights, batches=(1, 4))
-    assert one["deviation_nm"] == 0.0 and four["deviation_nm"] < 1e-5
+def test_arithmetic(small_weights: Weights) -> None:
+    single, half = measure_precision(small_weights, compiled=False)
+    assert single["deviation_nm"] == 0.0 and half["arithmetic"] == "bf16"
+    assert 1e-6 < half["rms_nm"] <= half["deviation_nm"], "bf16 must not be float32 by another name"
 
 
 def test_a_whole_stress_test_writes_its_tables(tmp_path: Path, small_weights: Weights) -> None:
-    config = StressConfig(frames=(80,), replicas=2, guards=("off",), sections=("length", "batches"), chunks=1,
-                          compiled=False)  # fmt: skip
-    told: list[str] = []
-    result = run_stress(small_weights, tmp_path, config, report=told.append)
-    assert told == ["length", "batches"]
+    options = StressOptions(frames=[80], replicas=2, guards=["off"], sections=["length", "precision"], quick=True)
+    shown: list[str] = []
+    result = run_stress(small_weights, tmp_path, options, report=shown.append)
+    assert shown == ["length", "precision"]
     (row,) = result["sections"]["length"]
-    assert row["frames"] == 80 and 0.0 <= row["valid_half_angstrom_%"] <= 100.0 and row["invalid_unmarked"] == 0
+    assert row["frames"] == 80 and 0.0 <= row["valid_half_angstrom_%"] <= 100.0
     assert json.loads((tmp_path / "stress.json").read_text())["sections"]["length"][0]["frames"] == 80
     text = (tmp_path / "stress.md").read_text()
-    assert "## Long rollouts" in text and "invalid unmarked" in text and text == markdown(result)
-
-
-def test_a_stress_test_is_added_to(tmp_path: Path, small_weights: Weights) -> None:
-    def run(weights: Weights, frames: int, *sections: str) -> dict[str, Any]:
-        config = StressConfig(frames=(frames,), replicas=2, guards=("off",), sections=sections, compiled=False)
-        return run_stress(weights, tmp_path, config, report=lambda name: None)["sections"]
-
-    run(small_weights, 40, "batches")
-    run(small_weights, 80, "length")
-    found = run(small_weights, 40, "length")
-    assert list(found) == ["length", "batches"] and [row["frames"] for row in found["length"]] == [40, 80]
+    assert "## Long rollouts" in text and "chunks helped" in text and text == markdown(result)
     other = replace(small_weights, hash="another")
-    (row,) = run(other, 40, "length")["length"]
+    (row,) = run_stress(other, tmp_path, replace(options, sections=["length"]))["sections"]["length"]
     assert "complete, but of weights_hash" in row["outcome"], "rollouts of other weights are not taken for its own"
+    with pytest.raises(InputError, match="ten frames"):
+        run_stress(small_weights, tmp_path, StressOptions(frames=[100], replicas=16))
 
 
 @pytest.mark.parametrize("rigid", [True, False])
@@ -164,11 +135,3 @@ def test_openmm_moves_in_every_frame_under_the_constraints_of_the_reference(
         patch.setattr(Engine, "step", step)
         assert measure_openmm(replace(small_weights, domain=domain), n_frames=4)[0]["timestep_fs"] == 1.0
     assert taken[:5] == [50, 1, 1, 1, 1] and min(taken) == 1
-
-
-def test_settings_are_checked() -> None:
-    with pytest.raises(InputError, match=r"no section 'lenght'.*length"):
-        choose_config(StressOptions(sections=["lenght"]))
-    with pytest.raises(InputError, match="ten frames"):
-        choose_config(StressOptions(frames=[100], replicas=16))
-    assert choose_config(StressOptions(quick=True, frames=[5000])).frames == (5000,)
