@@ -37,15 +37,15 @@ def info(path: PathLike, scene: str | None = None) -> dict[str, Any]:
 
 def _run(folder: Path) -> dict[str, Any] | None:
     """Return what the folder of a run, or of runs of many molecules, says of itself; None for another folder."""
-    path = next((file for file in (folder / "run.json", folder / "results.json") if file.is_file()), None)
-    if path is None:
+    from surrogate.verbs.run.run_record import RUN_NAME, RunResult
+
+    if (folder / RUN_NAME).is_file():
+        return RunResult.of(folder)
+    path = folder / "results.json"
+    if not path.is_file():
         return None
     try:
         found = parsed(content(path))
-        if path.name == "run.json":
-            outcome, stages = found["outcome"], len(found["stages"])
-            summary = outcome["headline"] if outcome else f"not done; {stages} stages have ended"
-            return {"file": str(folder), "type": "run", "summary": summary, **found}
         lines = {line["name"]: f"failed: {line['failed']}" if line["failed"] else line["headline"] for line in found}
     except UNREADABLE as error:
         raise InputError(f"{path} cannot be read as the record of a run ({first_line(error)}).") from None
