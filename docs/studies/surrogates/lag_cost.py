@@ -19,7 +19,7 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
-from surrogate.bench.accuracy import refuse_trained_on, samples_per_second
+from surrogate.bench.cost_error import refuse_trained_on, samples_per_second
 from surrogate.bench.timing import Roller, machine_facts, roll_in_turns
 from surrogate.comparison.measure.distributions import RAMACHANDRAN_BINS, distance, is_positive
 from surrogate.models.architecture import weights_path

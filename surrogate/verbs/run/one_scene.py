@@ -16,8 +16,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
 from surrogate.progress import ProgressFn, progress_bar
+from surrogate.verbs.inputs import prepare_scene
 from surrogate.verbs.options import RunOptions, tell
-from surrogate.verbs.reference import resolve_run
 from surrogate.verbs.run.decision import (
     LEAST_MD_S,
     MD_STAGES,
@@ -33,7 +33,7 @@ from surrogate.verbs.run.decision import (
 from surrogate.verbs.run.rates import by_openmm, measure
 from surrogate.verbs.run.run_record import RUN_NAME, RunRecord, StageEntry, read_run, settings_of_run, write_run
 from surrogate.verbs.run.stages import STAGES, Site, md_options
-from surrogate.verbs.scenes import prepare_scene
+from surrogate.verbs.simulate import resolve_run
 from systems.errors import InputError, SimulationError, SurromdError
 from systems.files.whole_file import OutputLock
 from systems.interrupts import deferred_interrupt, stop_when

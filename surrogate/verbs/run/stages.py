@@ -15,12 +15,12 @@ from typing import TYPE_CHECKING, Any
 
 from surrogate.comparison.verdict import LEAST_SAMPLES
 from surrogate.verbs.compare import compare
+from surrogate.verbs.inputs import summarised_outputs
 from surrogate.verbs.options import MDSettings, ReferenceOptions, RolloutOptions, RunOptions, TrainOptions
-from surrogate.verbs.outputs import summarised_outputs
-from surrogate.verbs.rollout import rollout
 from surrogate.verbs.run.decision import Decision, Stage, Way, errors_in_words, expected_errors, md_ps, table
 from surrogate.verbs.run.rates import Rates, Rolls, rollout_rate
 from surrogate.verbs.run.run_record import ANSWER_NAME, REPORT_NAME, Outcome, RunRecord
+from surrogate.verbs.simulate import rollout
 from surrogate.verbs.train import train
 from systems.errors import InputError, SimulationError
 from systems.files.whole_file import create_whole
@@ -365,8 +365,9 @@ def _remedy(comparison: Comparison, costs: Costs) -> str:
         return f"the MD it is compared with is too short to be tested: {found.reasons[0]}."
     if found is not None and not found.converged:
         said = f"MD, {found.verdict.rstrip('.')}; {found.remedy}"
-        is_longer = found.needed_ps is not None and found.needed_ps > found.replica_ps
-        return f"{said}: {budget(found.needed_ps / found.replica_ps)}." if is_longer else f"{said}."
+        if found.needed_ps is None or found.needed_ps <= found.replica_ps:
+            return f"{said}."
+        return f"{said}: {budget(found.needed_ps / found.replica_ps)}."
     n = evaluated.effective_samples
     if evaluated.status == "undecided" and 0.0 < n < LEAST_SAMPLES:
         return (

@@ -15,18 +15,21 @@ import pytest
 from compare_speed import pose, torsion_path
 from typer.testing import CliRunner
 
-from surrogate.bench.accuracy import (
+from surrogate.bench.cost_error import (
     HeldOut,
+    Setting,
+    choose_settings,
     compare_frames,
     compare_reference,
     effective_row,
     equivalent_time_row,
+    markdown,
     read_reference,
     refuse_trained_on,
+    run_cost_error,
     samples_per_second,
     slowest_torsion,
 )
-from surrogate.bench.cost_error import Setting, choose_settings, markdown, run_cost_error
 from surrogate.cli import main
 from surrogate.models.architecture import weights_path
 from surrogate.models.weights import Weights, load_weights, save_weights
@@ -300,8 +303,8 @@ def test_the_slowest_torsion_is_one_whose_time_is_known(monkeypatch: pytest.Monk
             total_ps = 10_000.0
 
     names = [("ψ", ""), ("", "χ of 3"), ("φ", "")]
-    monkeypatch.setattr("surrogate.bench.accuracy.turning", lambda f: [(s, label, []) for s, label in names])
-    monkeypatch.setattr("surrogate.bench.accuracy.relaxation_of", lambda sample, k: (Value(0.0), Value(taus[k])))
+    monkeypatch.setattr("surrogate.bench.cost_error.turning", lambda f: [(s, label, []) for s, label in names])
+    monkeypatch.setattr("surrogate.bench.cost_error.relaxation_of", lambda sample, k: (Value(0.0), Value(taus[k])))
     found = slowest_torsion([Fake(), Fake()])  # type: ignore[list-item]
     assert found is not None and found["name"] == "cos χ of 3" and found["samples"] == pytest.approx(20_000 / 50)
     assert slowest_torsion([Fake()] * 40)["name"] == "cos φ", "with 222 of it at hand"  # type: ignore[list-item,index]

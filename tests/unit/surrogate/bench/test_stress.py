@@ -77,10 +77,10 @@ def test_drift_between_first_and_last_tenth(
 def test_odd_inputs_are_refused_with_their_reason(small_weights: Weights) -> None:
     rows = {row["input"]: row for row in measure_odd_inputs(small_weights, chunks=1)}
     assert rows["noise of 0.001 nm"]["outcome"] == "run" and rows["noise of 0.001 nm"]["forced"] == ""
-    assert rows["mirrored"]["reasons"] == "stereo, start" and rows["mirrored"]["forced"] == "run, marked"
-    for name in ("heavy atoms only", "a proton less", "a coordinate that is no number"):
+    assert rows["strained: all bonds 40 % longer"]["reasons"] == "start"
+    for name in ("mirrored", "heavy atoms only", "a proton less", "a coordinate that is no number"):
         assert rows[name]["outcome"] == "refused" and rows[name]["forced"] == "refused too", name
-    assert rows["heavy atoms only"]["reasons"].startswith("size")
+    assert rows["heavy atoms only"]["reasons"] == "molecule"
     assert "start" in rows["clashing: two far atoms 0.02 nm apart"]["reasons"]
 
 

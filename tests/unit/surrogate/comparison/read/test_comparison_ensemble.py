@@ -12,7 +12,7 @@ import pytest
 
 from surrogate.comparison.read.ensemble import Ensemble, alike, load_ensemble
 from surrogate.data import collect_frames
-from surrogate.verbs.outputs import find_trajectories
+from surrogate.verbs.inputs import find_trajectories
 from surrogate.verbs.run.stages import notable
 from systems.chemistry.geometry import torsion
 from systems.errors import InputError, OutOfDomainError, TrajectoryError
