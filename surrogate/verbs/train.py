@@ -29,7 +29,7 @@ from systems.units import format_time_ps
 
 if TYPE_CHECKING:
     from surrogate.data import References
-    from surrogate.models.architecture import Choice, Trainer, TrainingRequest
+    from surrogate.models.architecture import Trainer, TrainingRequest
     from surrogate.models.potential import Potential
     from surrogate.models.weights import Weights
 
@@ -68,20 +68,6 @@ def windows(references: Trajectories, out: PathLike, options: WindowsOptions) ->
         out.unlink()
         raise
     return out
-
-
-@dataclass(frozen=True)
-class _Plan:
-    """What will be trained and how. `why`: one line for the architecture and one for each setting that was chosen."""
-
-    trainer: Trainer
-    references: References
-    request: TrainingRequest
-    choices: tuple[Choice, ...]
-    why: str
-
-    def lines(self) -> list[str]:
-        return [f"arch = {self.request.arch}: {self.why}", *(choice.line() for choice in self.choices)]
 
 
 @options_as_keywords(TrainOptions)
@@ -129,17 +115,18 @@ def train(references: Trajectories, out: PathLike, options: TrainOptions) -> Pat
         return written
     from surrogate.training.devices import choose_device, is_first_process
 
-    plan = _plan(references, options.validation, replace(asked, device=choose_device(options.device)))
+    asked = replace(asked, device=choose_device(options.device))
+    trainer, found, asked, lines = _plan(references, options.validation, asked)
     first, quiet = is_first_process(), options.quiet
-    prepared = plan.trainer.prepare(plan.references, plan.request)
+    prepared = trainer.prepare(found, asked)
     if first and not quiet:
-        for line in plan.lines():
+        for line in lines:
             tell(out.name, line)
     lock = OutputLock(out) if first else nullcontext()
     with lock, progress_bar(f"training {prepared.scene}", quiet=quiet or not first) as bar, _said_when_stopped(out):
         written = prepared.start(_shown(bar))
     if first:
-        _conclude(written, fitted=plan.trainer.fitted, quiet=quiet)
+        _conclude(written, fitted=trainer.fitted, quiet=quiet)
     return written
 
 
@@ -162,12 +149,12 @@ def explain_training(references: Trajectories, options: TrainOptions) -> str:
     """
     from surrogate.models.architecture import toml_text
 
-    plan = _plan(references, options.validation, _asked(options, Path("explained.safetensors")), explained=True)
-    head = "".join(f"# {line}\n" for line in plan.lines())
-    tables = plan.trainer.settings(plan.request).tables()
-    if plan.request.start_from is not None:
+    asked = _asked(options, Path("explained.safetensors"))
+    trainer, _, asked, lines = _plan(references, options.validation, asked, explained=True)
+    tables = trainer.settings(asked).tables()
+    if asked.start_from is not None:
         tables.pop("model", None)
-    return head + toml_text({"arch": plan.request.arch, **tables})
+    return "".join(f"# {line}\n" for line in lines) + toml_text({"arch": asked.arch, **tables})
 
 
 def _asked(options: TrainOptions, out: Path) -> TrainingRequest:
@@ -196,9 +183,11 @@ def _asked(options: TrainOptions, out: Path) -> TrainingRequest:
     )
 
 
-def _plan(references: Trajectories, validation: Trajectories | None, asked: TrainingRequest, *,
-          explained: bool = False) -> _Plan:  # fmt: skip
-    """Find the references and choose what is not asked for."""
+def _plan(
+    references: Trajectories, validation: Trajectories | None, asked: TrainingRequest, *, explained: bool = False
+) -> tuple[Trainer, References, TrainingRequest, list[str]]:
+    """Find the references and choose what is not asked for; return what trains, on what, how, and the reasons: a line
+    for the architecture and one for each setting that was chosen."""
     from surrogate.data import References
 
     if asked.arch and asked.start_from is not None:
@@ -211,23 +200,17 @@ def _plan(references: Trajectories, validation: Trajectories | None, asked: Trai
     found = References(tuple(paths), tuple(held), spool=asked.out.parent)
     why = "asked for"
     if not asked.arch:
-        name, why = _suited(found)
-        asked = replace(asked, arch=name)
+        fits = [(fit, name) for name in names() if (fit := architecture(name).suits(found.survey)) is not None]
+        if not fits:
+            raise InputError("no installed architecture suits these references by itself; name one with `arch`.")
+        best, name = max(fits, key=lambda each: each[0].rank)
+        asked, why = replace(asked, arch=name), best.reason
     trainer: Trainer = architecture(asked.arch).trainer()
     if not explained:
         trainer.check(asked)
     choices = trainer.choose(found, asked)
-    return _Plan(trainer, found, asked.with_choices(choices), choices, why)
-
-
-def _suited(references: References) -> tuple[str, str]:
-    """Return the name of the architecture that suits the references best, and why."""
-    survey = references.survey
-    fits = [(fit, name) for name in names() if (fit := architecture(name).suits(survey)) is not None]
-    if not fits:
-        raise InputError("no installed architecture suits these references by itself; name one with `arch`.")
-    best, name = max(fits, key=lambda found: found[0].rank)
-    return name, best.reason
+    lines = [f"arch = {asked.arch}: {why}", *(choice.line() for choice in choices)]
+    return trainer, found, asked.with_choices(choices), lines
 
 
 @contextmanager

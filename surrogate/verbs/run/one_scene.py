@@ -215,7 +215,11 @@ class _Run:
         first."""
         found = self.clock.work(doing, self.clock.budget_s, work)
         if found is None:
-            raise InputError(f"the budget is spent while {doing}; give more `budget_s`.")
+            budget_s = self.clock.budget_s
+            raise InputError(
+                f"the budget of {format_wall(budget_s)} is spent while {doing}, before anything is simulated. Use "
+                f"`budget_s='{math.ceil(max(2.0 * budget_s, 60.0))}s'` or more."
+            )
         return found
 
     def to_the_end(self, site: Site) -> RunRecord:
