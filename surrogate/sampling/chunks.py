@@ -29,6 +29,7 @@ from surrogate.data import fitted_atoms
 from surrogate.models.layers import with_compiled_parts, with_lean_parts
 from surrogate.models.potential import Potential
 from surrogate.models.propagator import Propagator, draw_noise
+from surrogate.sampling.config import RolloutConfig
 from surrogate.sampling.coupling import Coupling, PotentialChecks
 from surrogate.training.devices import choose_precision, keep_freed_memory, torch_threads
 from systems.chemistry import validity
@@ -349,6 +350,29 @@ class Chunk:
     failure: tuple[int, str] | None = None
 
 
+@dataclass
+class Progress:
+    """Where a rollout stands between two chunks.
+
+    `last_frames (replicas, n_conditioning, n_atoms, 3)` nm, in the model's atom order and the user's pose, relative to
+    where the scene's centre was; `velocities (replicas, n_atoms, 3)` nm/ps of a model that carries them. `steps`: model
+    frames done, kept or not. `batch`: replicas computed at once, if memory has run out before. `drawn`: chunks drawn of
+    all replicas, further draws included, which took `evaluations` of the network together.
+    """
+
+    last_frames: npt.NDArray[np.float32]
+    velocities: npt.NDArray[np.float32] | None = None
+    chunks: int = 0
+    steps: int = 0
+    wall_s: float = 0.0
+    batch: int | None = None
+    drawn: int = 0
+    evaluations: float = 0.0
+    # Wall seconds of the batch by what they went into: draw, check, draw again, relax, md, energy.
+    seconds: dict[str, float] = field(default_factory=dict)
+    tallies: list[Tally] = field(default_factory=list)
+
+
 def none_through(tallies: Sequence[Tally], n_new: int, *, at_end: bool) -> tuple[int, str] | None:
     """Return the worst replica and what is wrong, where a model has drawn no chunk of `n_new` frames that passes.
 
@@ -368,57 +392,46 @@ def none_through(tallies: Sequence[Tally], n_new: int, *, at_end: bool) -> tuple
     return row, f"{which} was caught ({100 * frames / (chunks * n_new):.0f} % of frames: {named})"
 
 
+@dataclass(eq=False)
 class Interventions:
-    """Draws chunks and treats frames that the checks caught as `guard` says (`surrogate.sampling.config.GUARDS`).
+    """Draws the chunks that follow `state` and treats frames that the checks caught as `config.guard` says
+    (`surrogate.sampling.config.GUARDS`). Tallies and seconds of the state are brought up to date.
 
     `coupling` is needed by 'repair' and 'fallback'; `potential` checks the frames of a learned potential, and the
-    energy of every `energy_every`-th of them. `seconds`: wall seconds of the batch by what they went into (draw,
-    check, draw again, relax, md, energy), brought up to date.
+    energy of every `config.energy_every`-th of them.
     """
 
-    last: FloatArray
-    velocities: FloatArray | None
-    tallies: Sequence[Tally]
-    chunk: Chunk
+    sampler: ChunkSampler
+    checks: Guard
+    config: RolloutConfig
+    state: Progress
+    coupling: Coupling | None = None
+    potential: PotentialChecks | None = None
+    chunk: Chunk = field(init=False)
 
-    def __init__(
-        self, sampler: ChunkSampler, checks: Guard, guard: str, seed: int, seconds: dict[str, float],
-        coupling: Coupling | None = None, potential: PotentialChecks | None = None, energy_every: int = 0,
-    ) -> None:  # fmt: skip
-        self.sampler, self.checks, self.guard, self.seed, self.seconds = sampler, checks, guard, seed, seconds
-        self.coupling, self.potential, self.energy_every = coupling, potential, energy_every
-        self.number = self.step = 0
-
-    def advance(
-        self, last_nm: FloatArray, velocities_nm_ps: FloatArray | None, tallies: Sequence[Tally], *, chunk: int,
-        step: int,
-    ) -> Chunk:  # fmt: skip
-        """Return the chunk number `chunk` after `last_nm (b, n_conditioning, n_atoms, 3)`, `step` frames into the run.
-
-        Tallies are brought up to date. Frames are in it as they are to be written; where `failure` is set, the
-        rollout must stop.
-        """
-        self.last, self.velocities, self.tallies, self.number, self.step = (
-            last_nm, velocities_nm_ps, tallies, chunk, step
-        )  # fmt: skip
+    def advance(self) -> Chunk:
+        """Return the next chunk, its frames as they are to be written; where `failure` is set, the rollout must
+        stop."""
         self.draw()
-        if self.guard not in ("off", "flag"):
+        if self.config.guard not in ("off", "flag"):
             self.help_rows()
         self.compare()
-        for tally, marks in zip(tallies, self.chunk.marks, strict=True):
+        for tally, marks in zip(self.state.tallies, self.chunk.marks, strict=True):
             tally.note_marks(marks)
             tally.chunks += 1
         return self.chunk
 
     def draw(self) -> None:
         """Draw the chunk, check it, and enter the caught frames in the tallies."""
-        with timed(self.seconds, "draw"):
-            drawn = self.sampler.draw(self.last, self._seeds(range(len(self.last)), 0), self.velocities)
+        with timed(self.state.seconds, "draw"):
+            drawn = self.sampler.draw(
+                self.state.last_frames, self._seeds(range(len(self.state.last_frames)), 0), self.state.velocities
+            )
         shape = drawn.frames_nm.shape[:2]
         flags, marks = np.zeros(shape, dtype=np.uint16), np.zeros(shape, dtype=np.uint8)
         self.chunk = Chunk(drawn.frames_nm, flags, marks, np.full(shape, np.nan), drawn.velocities_nm_ps)
         self._check(np.arange(shape[0]))
-        for row, tally in enumerate(self.tallies):
+        for row, tally in enumerate(self.state.tallies):
             bad = np.flatnonzero(caught(self.chunk.flags[row]))
             if len(bad):
                 tally.note_caught(self.chunk.flags[row, bad])
@@ -439,7 +452,7 @@ class Interventions:
                 return
         first = pending[0]
         what = f"{MOST_DRAWS} further draws gave no chunk that passes ({self._reasons(first)})"
-        if self.tallies[first].md_in_a_row > MOST_MD_IN_A_ROW:
+        if self.state.tallies[first].md_in_a_row > MOST_MD_IN_A_ROW:
             what = f"MD had to finish {MOST_MD_IN_A_ROW} chunks in a row, and {what}"
         self.chunk.failure = (first, what)
 
@@ -448,14 +461,14 @@ class Interventions:
         for a whole chunk, or for as many short ones as hold MOST_INVALID_IN_A_ROW frames."""
         if self.chunk.failure is not None:
             return
-        for row in range(len(self.last)):
+        for row in range(len(self.state.last_frames)):
             if self.chunk.flags[row, -1] & validity.NOT_FINITE or not np.isfinite(self.chunk.frames_nm[row, -1]).all():
                 self.chunk.failure = (row, "the model's frames are no longer finite")
                 continue
             invalid = (self.chunk.flags[row] & np.uint16(validity.INVALID | validity.STILL)).all()
-            tally = self.tallies[row]
+            tally = self.state.tallies[row]
             tally.invalid_in_a_row = tally.invalid_in_a_row + self.chunk.flags.shape[1] if invalid else 0
-            if self.guard == "flag" and tally.invalid_in_a_row >= MOST_INVALID_IN_A_ROW:
+            if self.config.guard == "flag" and tally.invalid_in_a_row >= MOST_INVALID_IN_A_ROW:
                 self.chunk.failure = (row, f"{tally.invalid_in_a_row} frames and no valid one ({self._reasons(row)})")
 
     def _resolve(self, row: int, attempt: int) -> bool:
@@ -463,13 +476,13 @@ class Interventions:
         draw without a frame that passes is not worth it: there is another."""
         bad = np.flatnonzero(caught(self.chunk.flags[row]))
         if not len(bad):
-            self.tallies[row].md_in_a_row = 0
+            self.state.tallies[row].md_in_a_row = 0
             return True
         if attempt == 0 and self._none_passes(row):
             return False
-        if self.guard == "repair":
+        if self.config.guard == "repair":
             return self._repair(row)
-        return self.guard == "fallback" and self._fall_back(row, int(bad[0]))
+        return self.config.guard == "fallback" and self._fall_back(row, int(bad[0]))
 
     def _repair(self, row: int) -> bool:
         """Relax the caught frames of a row, first to last; return whether all of them are valid then."""
@@ -482,7 +495,7 @@ class Interventions:
             if self.chunk.marks[row, frame] == REPAIRED:
                 return False
             try:
-                with timed(self.seconds, "relax"):
+                with timed(self.state.seconds, "relax"):
                     relaxed = self.coupling.relax(self.chunk.frames_nm[row, frame])
             except SimulationError:
                 return False
@@ -494,13 +507,13 @@ class Interventions:
     def _fall_back(self, row: int, first: int) -> bool:
         """Replace a row from frame `first` on by MD; return whether it could be done."""
         assert self.coupling is not None
-        tally = self.tallies[row]
+        tally = self.state.tallies[row]
         tally.md_in_a_row += 1
         if tally.md_in_a_row > MOST_MD_IN_A_ROW:
             return False
         n = self.chunk.frames_nm.shape[1] - first
         try:
-            with timed(self.seconds, "md"):
+            with timed(self.state.seconds, "md"):
                 segment = self.coupling.simulate(self._history(row, first)[-1], n, seed=self._seed(row, _MD_ATTEMPT))
         except SimulationError:
             return False
@@ -517,14 +530,14 @@ class Interventions:
         histories = np.stack([self._history(row, first) for row, first in zip(rows, firsts, strict=True)])
         velocities = None
         if self.chunk.velocities_nm_ps is not None:
-            velocities = np.full((len(rows), *self.last.shape[2:]), np.nan)
+            velocities = np.full((len(rows), *self.state.last_frames.shape[2:]), np.nan)
             for k, (row, first) in enumerate(zip(rows, firsts, strict=True)):
-                if first == 0 and self.velocities is not None:
-                    velocities[k] = self.velocities[row]
-        with timed(self.seconds, "draw again"):
+                if first == 0 and self.state.velocities is not None:
+                    velocities[k] = self.state.velocities[row]
+        with timed(self.state.seconds, "draw again"):
             drawn = self.sampler.draw(histories, self._seeds(rows, attempt), velocities)
         for k, (row, first) in enumerate(zip(rows, firsts, strict=True)):
-            self.tallies[row].draws += 1
+            self.state.tallies[row].draws += 1
             self._replace(row, first, drawn.frames_nm[k, : drawn.frames_nm.shape[1] - first], DRAWN_AGAIN)
             if self.chunk.velocities_nm_ps is not None and drawn.velocities_nm_ps is not None:
                 # Those of the draw belong to its last frame, which is cut off where the row began before it.
@@ -538,26 +551,26 @@ class Interventions:
 
     def _history(self, row: int, first: int) -> FloatArray:
         """The frames `(n_conditioning, n_atoms, 3)` before frame `first` of a row."""
-        n = self.last.shape[1]
-        return np.concatenate([self.last[row], self.chunk.frames_nm[row, :first]])[-n:]
+        n = self.state.last_frames.shape[1]
+        return np.concatenate([self.state.last_frames[row], self.chunk.frames_nm[row, :first]])[-n:]
 
     def _check(self, rows: npt.NDArray[np.int64]) -> None:
-        with timed(self.seconds, "check"):
-            frames, before = self.chunk.frames_nm[rows], self.last[rows, -1]
-            flags = self.checks.check(frames, before, from_start=self.step == 0)
+        with timed(self.state.seconds, "check"):
+            frames, before = self.chunk.frames_nm[rows], self.state.last_frames[rows, -1]
+            flags = self.checks.check(frames, before, from_start=self.state.steps == 0)
             if self.potential is not None:
                 flags |= np.uint16(validity.UNSURE) * self.potential.unsure(frames)
             self.chunk.flags[rows] = flags
-        if self.potential is not None and self.energy_every:
-            with timed(self.seconds, "energy"):
+        if self.potential is not None and self.config.energy_every:
+            with timed(self.state.seconds, "energy"):
                 for row in rows.tolist():
                     self._check_energies(row, self.potential)
 
     def _check_energies(self, row: int, potential: PotentialChecks) -> None:
         """Flag frames whose turn it is and whose energy is far from the reference's."""
-        steps = self.step + 1 + np.arange(self.chunk.flags.shape[1])
+        steps = self.state.steps + 1 + np.arange(self.chunk.flags.shape[1])
         energies = self.chunk.energies_kj_mol[row]
-        for k in np.flatnonzero((steps % self.energy_every == 0) & ~caught(self.chunk.flags[row])).tolist():
+        for k in np.flatnonzero((steps % self.config.energy_every == 0) & ~caught(self.chunk.flags[row])).tolist():
             if np.isnan(energies[k]):
                 energies[k] = potential.difference(self.chunk.frames_nm[row, k])
             if potential.is_wrong(energies[k]):
@@ -565,14 +578,14 @@ class Interventions:
 
     def _caught_rows(self) -> list[int]:
         rows: list[int] = np.flatnonzero(caught(self.chunk.flags).any(axis=1)).tolist()
-        for row, tally in enumerate(self.tallies):
+        for row, tally in enumerate(self.state.tallies):
             if row not in rows:
                 tally.md_in_a_row = 0
         return rows
 
     def _is_wrong(self, row: int) -> bool:
         """Whether no frame of this caught row passes, and no earlier chunk of it has got through without help."""
-        tally = self.tallies[row]
+        tally = self.state.tallies[row]
         return self._none_passes(row) and tally.chunks == tally.chunks_caught - 1
 
     def _none_passes(self, row: int) -> bool:
@@ -582,7 +595,7 @@ class Interventions:
         return ", ".join(validity.flag_names(int(np.bitwise_or.reduce(self.chunk.flags[row]))))
 
     def _seed(self, row: int, attempt: int) -> int:
-        return noise_seed(self.seed, row, self.number, attempt)
+        return noise_seed(self.config.seed, row, self.state.chunks, attempt)
 
     def _seeds(self, rows: Sequence[int] | range, attempt: int) -> list[int]:
         return [self._seed(row, attempt) for row in rows]

@@ -7,7 +7,7 @@ import io
 import time
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -17,7 +17,16 @@ import numpy.typing as npt
 import torch
 
 from surrogate.models.potential import Potential
-from surrogate.sampling.chunks import Chunk, ChunkSampler, Guard, Interventions, Tally, noise_seed, none_through
+from surrogate.sampling.chunks import (
+    Chunk,
+    ChunkSampler,
+    Guard,
+    Interventions,
+    Progress,
+    Tally,
+    noise_seed,
+    none_through,
+)
 from surrogate.sampling.config import RolloutConfig as RolloutConfig
 from surrogate.sampling.coupling import Coupling, PotentialChecks
 from surrogate.sampling.domain import DomainMatch, fit_weights, in_bath
@@ -95,30 +104,6 @@ def resolve_plan(
 
 
 # Checkpoint of a rollout: written beside its first file after each flush, read by `resume`.
-
-Float32Array = npt.NDArray[np.float32]
-
-
-@dataclass
-class Progress:
-    """Where a rollout stands between two chunks.
-
-    `last_frames (replicas, n_conditioning, n_atoms, 3)` nm, in the model's atom order and the user's pose, relative to
-    where the scene's centre was; `velocities (replicas, n_atoms, 3)` nm/ps of a model that carries them. `steps`: model
-    frames done, kept or not. `batch`: replicas computed at once, if memory has run out before. `drawn`: chunks drawn of
-    all replicas, further draws included, which took `evaluations` of the network together.
-    """
-
-    last_frames: Float32Array
-    velocities: Float32Array | None = None
-    chunks: int = 0
-    steps: int = 0
-    wall_s: float = 0.0
-    batch: int | None = None
-    drawn: int = 0
-    evaluations: float = 0.0
-    seconds: dict[str, float] = field(default_factory=dict)
-    tallies: list[Tally] = field(default_factory=list)
 
 
 def packed_progress(progress: Progress) -> tuple[dict[str, Any], bytes]:
@@ -397,9 +382,7 @@ def rollout(
             stack.callback(coupling.close)
         potential = PotentialChecks(weights, coupling) if isinstance(weights.model, Potential) else None
         run = _Rollout(plan, sampler, state, state_path, header, outs)
-        engine = Interventions(
-            sampler, run.checks, config.guard, config.seed, state.seconds, coupling, potential, config.energy_every
-        )
+        engine = Interventions(sampler, run.checks, config, state, coupling, potential)
         if not state.steps:
             # Before there are files, so that a rollout killed at any later moment can be gone on with.
             run.save()
@@ -407,9 +390,7 @@ def rollout(
         started = time.monotonic() - state.wall_s
         flushed_at, flushed_s = time.monotonic(), 0.0
         while state.steps < plan.n_steps:
-            chunk = engine.advance(
-                state.last_frames, state.velocities, state.tallies, chunk=state.chunks, step=state.steps
-            )
+            chunk = engine.advance()
             state.wall_s = time.monotonic() - started
             if chunk.failure is None and config.guard == "flag":
                 at_end = state.steps + chunk.frames_nm.shape[1] >= plan.n_steps

@@ -322,17 +322,14 @@ def _row(result: dict[str, Any]) -> str:
     if result["failed"]:
         reason = f'<td colspan="{len(_HEADS) - 1}">failed: {escape(result["failed"])}</td>'
         return f'<tr><th scope="row">{name}</th>{reason}</tr>'
-    link = f'<a href="{quote(result["name"])}/report.html">{name}</a>'
-    speed_up = "" if result["speed_up"] is None else f"{result['speed_up']:.2g}"
     cells = (
         result["way"],
         format_time_ps(result["rolled_ps"], 2),
         format_time_ps(result["held_out_ps"], 2),
         result["equivalent_time"] or "-",
-        speed_up,
+        "" if result["speed_up"] is None else f"{result['speed_up']:.2g}",
         result["verdict"],
         format_wall(result["wall_s"]),
     )
-    labelled = zip(_HEADS[1:], cells, strict=True)
-    columns = "".join(f'<td data-label="{head}">{escape(cell)}</td>' for head, cell in labelled)
-    return f'<tr><th scope="row">{link}</th>{columns}</tr>'
+    columns = "".join(f'<td data-label="{head}">{escape(cell)}</td>' for head, cell in zip(_HEADS[1:], cells))
+    return f'<tr><th scope="row"><a href="{quote(result["name"])}/report.html">{name}</a></th>{columns}</tr>'

@@ -259,8 +259,9 @@ def test_a_batch_that_memory_does_not_hold_is_halved(tmp_path: Path, scene: Scen
 def test_chunks_of_one_frame_end_a_rollout_only_when_several_in_a_row_are_invalid() -> None:
     flags = np.zeros((1, 1), dtype=np.uint16)
     helper = SimpleNamespace(
-        chunk=SimpleNamespace(flags=flags, frames_nm=np.zeros((1, 1, 3, 3)), failure=None), last=[None],
-        guard="flag", tallies=[Tally()], _reasons=lambda row: "clash",
+        chunk=SimpleNamespace(flags=flags, frames_nm=np.zeros((1, 1, 3, 3)), failure=None),
+        config=SimpleNamespace(guard="flag"), state=SimpleNamespace(last_frames=[None], tallies=[Tally()]),
+        _reasons=lambda row: "clash",
     )  # fmt: skip
     failed = []
     for invalid in (1, 1, 1, 0, 1, 1, 1, 1):
