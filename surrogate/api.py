@@ -6,13 +6,11 @@ Times are in ps, temperatures in K, frictions in 1/ps, masses in dalton; a text 
 message is one line.
 """
 
-from surrogate.verbs.campaign import campaign
 from surrogate.verbs.compare import compare, demo
 from surrogate.verbs.info import info
-from surrogate.verbs.reference import plan, reference
-from surrogate.verbs.rollout import rollout
+from surrogate.verbs.inputs import systems
 from surrogate.verbs.run.run_scenes import run
-from surrogate.verbs.scenes import systems
+from surrogate.verbs.simulate import campaign, plan, reference, rollout
 from surrogate.verbs.train import explain_training, train, windows
 
 __all__ = [

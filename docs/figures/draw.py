@@ -32,11 +32,18 @@ def numbers(cell: str) -> list[float]:
     return [float(n) for n in re.findall(r"\d+(?:\.\d+)?", cell)]
 
 
+def pareto_front(points: list[tuple[float, float]]) -> list[int]:
+    """Return the places of points (effective samples a second, distance) that no other point beats in both."""
+    front: list[int] = []
+    for k in sorted(range(len(points)), key=lambda k: (-points[k][0], points[k][1])):
+        if not front or points[k][1] < points[front[-1]][1]:
+            front.append(k)
+    return front
+
+
 def draw_effective(table: dict[str, Any], out: Path) -> None:
     """Draw distance to the reference against effective samples a second, of the surrogates' settings and of MD, and the
     front: what nothing beats in both."""
-    from surrogate.bench.accuracy import pareto_front
-
     rows = [dict(zip(table["columns"], row, strict=True)) for row in table["rows"]]
     points = [(numbers(row["effective samples/s"])[0], numbers(row["distance"])[0]) for row in rows]
     figure, axes = plt.subplots(figsize=(6.4, 3.8), layout="constrained")

@@ -3,42 +3,59 @@
 `surromd bench cost-error` runs it. Each setting rolls the same time; its error is that of the φ/ψ map against two held-
 out runs, its cost the processor time of this process, one thread. Before each of its parts OpenMM runs for a moment, so
 that the ratio of the two does not hang on what else the machine does. MD's own error is that of pieces of one held-out
-run against the whole of the other (`comparison.equivalent_time`): it is taken to be the same at each time step,
-by simulated time.
+run against the whole of the other (`comparison.equivalent_time`).
+
+Effective samples are simulated time over 2 max(τ_model, τ_MD), τ the relaxation time of the slowest torsion of which
+the MD at hand holds at least 50: a model that forgets too fast gains nothing by it, and one that forgets too slowly
+loses. They say nothing of whether the samples are right; that is the distance beside them.
 """
 
 from __future__ import annotations
 
 import json
+import math
 import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict, replace
+from dataclasses import asdict, dataclass
 from itertools import product
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from surrogate.bench.accuracy import (
-    HeldOut,
-    compare_frames,
-    compare_reference,
-    effective_row,
-    equivalent_time_row,
-    fastest_openmm,
-    read_reference,
-    training_cost,
+from surrogate.bench.timing import (
+    OPENMM,
+    SIMD,
+    Frames,
+    Roller,
+    machine_facts,
+    markdown_table,
+    md_costs,
+    roll_in_turns,
 )
-from surrogate.bench.bench_options import STEPS, USUAL_BATCH, CostErrorConfig, CostErrorOptions, Setting, Sweep
-from surrogate.bench.cost_page import write_cost_error
-from surrogate.bench.timing import Roller, machine_facts, md_costs, roll_in_turns
+from surrogate.comparison.equivalent_time import (
+    EquivalentTime,
+    distance_to_reference,
+    equivalent_time_by,
+    joint_measure,
+)
+from surrogate.comparison.measure.distributions import block_occupancy
+from surrogate.comparison.measure.slow_motion import longest_correlation
+from surrogate.comparison.measure.statistics import block_length, estimate, make_blocks
+from surrogate.comparison.measure.structure import Baseline, Features, backbone
+from surrogate.comparison.read.ensemble import Ensemble, load_ensemble
+from surrogate.comparison.rows.kinetics_rows import relaxation_of, turning
+from surrogate.comparison.rows.rows import Options, Sample, make_sample
 from surrogate.sampling.chunks import ChunkSampler
 from surrogate.sampling.domain import fit_weights
 from surrogate.training.devices import torch_threads
-from surrogate.verbs.options import Trajectories
-from surrogate.verbs.outputs import find_trajectories
+from surrogate.verbs.inputs import find_trajectories
+from surrogate.verbs.options import CostErrorConfig, CostErrorOptions, Sweep, Trajectories
+from systems.chemistry.validity import BOND_20_PERCENT, BOND_HALF_ANGSTROM, NOT_FINITE
 from systems.errors import InputError, StorageError, SurromdError
+from systems.files.whole_file import create_whole
 from systems.options import part_of
+from systems.scene import Scene
 from systems.trajectory.codec import open_trajectory
 from systems.units import format_time_ps
 
@@ -46,6 +63,33 @@ if TYPE_CHECKING:
     from surrogate.models.weights import Weights
 
 ReportFn = Callable[[str], None]
+CHECKS = {
+    "valid_half_angstrom_%": NOT_FINITE | BOND_HALF_ANGSTROM,
+    "bonds_20_percent_%": NOT_FINITE | BOND_20_PERCENT,
+}
+# Below so many effective samples of MD, nobody knows its relaxation time.
+LEAST_SAMPLES = 50.0
+# A rollout with fewer whole molecules is drawn hollow: its error does not count.
+SOUND_PERCENT = 99.0
+_COLOURS = {"multistep": "#1f77b4", "fitted": "#d62728", "euler": "#7f7f7f", "dopri5": "#9467bd"}
+
+
+@dataclass(frozen=True)
+class Setting:
+    """One way to roll. `solver` None: of a model without one, for which `steps` mean nothing."""
+
+    solver: str | None
+    steps: int
+    precision: str = "auto"
+    batch: int = 32
+    compile: bool = False
+
+    @property
+    def label(self) -> str:
+        words = [f"{self.solver} {self.steps}" if self.solver else "as it is"]
+        words += [self.precision] if self.precision != "auto" else []
+        words += [f"batch {self.batch}"] if self.batch != Setting.batch else []
+        return ", ".join(words + (["compiled"] if self.compile else []))
 
 
 def cost_error(
@@ -69,29 +113,18 @@ def cost_error(
 
 
 def choose_settings(weights: Weights, sweep: Sweep) -> list[Setting]:
-    """Return the settings to run, of all solvers where none is named.
-
-    Where neither precisions nor batches are given, the usual solver at the usual steps is run in both precisions, alone
-    and in a batch; with `compiled` also compiled. Raises InputError for a solver that the weights do not know.
-    """
-    from surrogate.training.devices import choose_precision
+    """Return all combinations of what is asked for; without solvers those that take a batch at once. Raises InputError
+    for a solver that the weights do not know."""
+    from surrogate.models.lam_slide.flow import ADAPTIVE
 
     known = weights.model.solvers
     unknown = [name for name in sweep.solvers or () if name not in known]
     if unknown:
         raise InputError(f"{weights.path.name} knows no solver {unknown[0]!r}; choose {', '.join(known) or 'none'}.")
-    chosen: list[str | None] = [*(sweep.solvers or known)] or [None]
-    own = weights.model.usual_steps
-    numbers = (sweep.steps or STEPS) if known else (own,)
-    axes = chosen, numbers, sweep.precisions or ("auto",), sweep.batches or (USUAL_BATCH,)
-    found = [Setting(solver, n, precision, batch) for solver, n, precision, batch in product(*axes)]
-    usual = Setting(chosen[0], own if own in numbers else max(numbers))
-    if not (sweep.precisions or sweep.batches):
-        with_bf16 = choose_precision("auto", suits=weights.model.float32_layers is not None).bf16
-        found += [replace(usual, precision="fp32" if with_bf16 else "bf16"), replace(usual, batch=1)]
-    if sweep.compiled:
-        found += [replace(usual, compile=True)]
-    return list(dict.fromkeys(found))
+    solvers: list[str | None] = [*(sweep.solvers or [name for name in known if name not in ADAPTIVE])] or [None]
+    steps = sweep.steps if known else (weights.model.usual_steps,)
+    compiled = (False, True) if sweep.compiled else (False,)
+    return [Setting(*each) for each in product(solvers, steps, sweep.precisions, sweep.batches, compiled)]
 
 
 def run_cost_error(
@@ -112,8 +145,7 @@ def run_cost_error(
     weights = [one for one, _ in chosen]
     prints = [refuse_trained_on(w, reference, replicate, lag_ps=config.lag_ps) for w in weights]
     fitted = [_fitted(w, reference, config.lag_ps) for w in weights]
-    header = {"references": prints[0], "config": asdict(config)}
-    result = _earlier(folder, header)
+    result = _earlier(folder, {"references": prints[0], "config": asdict(config)})
     scene = fitted[0].domain.scene
     scenes = {w.domain.scene.topology_hash: w.domain.scene for w in fitted}  # atoms may stand in another order
     report("reading the references")
@@ -122,7 +154,7 @@ def run_cost_error(
     result |= {"machine": machine_facts(), "scene": scene.name, "files": [p.name for p in (*reference, *replicate)]}
     try:
         with torch_threads(config.threads):
-            if "slowest" not in result.get("md", {}):  # an earlier version's did not say
+            if "md" not in result:
                 report("OpenMM")
                 result["md"] = compare_reference(ref, seed=config.seed) | {"cost": md_costs(fitted[0], config)}
             for (one, settings), as_rolled in zip(chosen, fitted, strict=True):
@@ -131,8 +163,8 @@ def run_cost_error(
                     named = {"weights_hash": one.hash, **asdict(setting)}
                     if not any(row.items() >= named.items() for row in result["rows"]):
                         report(f"{one.path.stem}: {setting.label}")
-                        row = measure_setting(as_rolled, setting, of_these, config, result["md"].get("slowest"))
-                        result["rows"].append(row | _earned(row, one, result["md"]))
+                        row = measure_setting(as_rolled, setting, of_these, config, result["md"]["slowest"])
+                        result["rows"].append(row | effective_row(row, result["md"]))
                         write_cost_error(result, folder)
     except KeyboardInterrupt:
         raise KeyboardInterrupt(f"{folder} keeps the settings that were finished; the same command goes on") from None
@@ -152,43 +184,27 @@ def _fitted(weights: Weights, reference: Sequence[Path], lag_ps: float | None) -
     )[0]
 
 
-def _earned(row: dict[str, Any], weights: Weights, md: dict[str, Any]) -> dict[str, Any]:
-    """Return effective samples of a setting, and what its weights cost before; nothing of one that is only timed."""
-    if "slow_relaxation_ps" not in row:
-        return {}
-    before = training_cost(weights, fastest_openmm(md))
-    return effective_row(row, row["slow_relaxation_ps"]["value"], md) | {"before": before}
-
-
-def measure_setting(weights: Weights, setting: Setting, ref: HeldOut, config: CostErrorConfig,
-                    slowest: dict[str, Any] | None = None) -> dict[str, Any]:  # fmt: skip
+def measure_setting(
+    weights: Weights, setting: Setting, ref: HeldOut, config: CostErrorConfig, slowest: dict[str, Any] | None = None
+) -> dict[str, Any]:
     """Roll one setting in parts, by turns with OpenMM; return its cost, its errors and its equivalent MD time,
-    JSON-able. `slowest`: the torsion that effective samples are counted by (`accuracy.slowest_torsion`).
-
-    A batch smaller than the usual one is only timed, over a few chunks: replicas do not depend on those beside them.
-    """
+    JSON-able. `slowest`: the torsion that effective samples are counted by (`slowest_torsion`)."""
     named = {"weights": weights.path.stem, "weights_hash": weights.hash, "label": setting.label}
     row: dict[str, Any] = named | asdict(setting)
     try:
         sampler = ChunkSampler(weights, solver=setting.solver, solver_steps=setting.steps, precision=setting.precision,
                                compile=setting.compile)  # fmt: skip
         roller = Roller(weights, sampler, rows=setting.batch, seed=config.seed)
-        resolved = -(-config.discarded_ps // (sampler.n_new * weights.domain.lag_ps))
+        discarded = -(-config.discarded_ps // (sampler.n_new * weights.domain.lag_ps))
         started = time.process_time()
-        roller.advance(max(1, int(resolved)) * sampler.n_new)
+        roller.advance(max(1, int(discarded)) * sampler.n_new)
         row["first_chunks_s"] = time.process_time() - started
-        only_timed = setting.batch < USUAL_BATCH
-        if only_timed:
-            few_ps = 2 * config.rounds * sampler.n_new * setting.batch * weights.domain.lag_ps
-            config = replace(config, time_ps=min(config.time_ps, few_ps))
-        parts, costs = roll_in_turns(weights, roller, sampler, setting, config)
+        parts, costs = roll_in_turns(weights, roller, sampler, config)
     except (SurromdError, np.linalg.LinAlgError) as error:  # the latter where frames are no longer finite
         return row | {"outcome": f"not run: {error}"}
     frames = np.concatenate(parts, axis=1)
     ns = 1e-3 * frames.shape[0] * frames.shape[1] * weights.domain.lag_ps
     row |= {"bf16": sampler.precision.bf16, "evaluations": sampler.evaluations_per_chunk, "ns": ns, **costs}
-    if only_timed:
-        return row | {"timed_only": True}
     every = max(1, round(ref.reference.lag_ps / weights.domain.lag_ps))
     errors, equivalent_time = compare_frames(
         frames[:, every - 1 :: every], ref, seed=config.seed, slowest=None if slowest is None else slowest["torsion"]
@@ -208,6 +224,146 @@ def _earlier(folder: Path, header: dict[str, Any]) -> dict[str, Any]:
     if found and any(found.get(key) != value for key, value in header.items()):
         raise InputError(f"{path} is of other references, times or rounds; name another folder with `out`.")
     return {**header, "rows": [], **found}
+
+
+# ---- errors against held-out reference -----------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class HeldOut:
+    """Held-out reference and its replicate, measured once. `length_ps`: of each, as far as they are compared."""
+
+    scene: Scene
+    baseline: Baseline
+    reference: Features
+    replicate: Features
+
+    @property
+    def length_ps(self) -> float:
+        return min(self.reference.total_ps, self.replicate.total_ps)
+
+
+def read_reference(
+    scene: Scene, reference: Sequence[Path], replicate: Sequence[Path], lag_ps: float | None = None
+) -> HeldOut:
+    """Measure two held-out runs of `scene`, atoms in its order, frames `lag_ps` apart or all. Raises InputError for a
+    scene without φ and ψ."""
+    if not backbone(scene).residues:
+        raise InputError(f"{scene.name} has no residue with φ and ψ, by whose map errors are measured here.")
+    first, second = (load_ensemble(paths, template=scene) for paths in (reference, replicate))
+    if lag_ps is not None:
+        first, second = (run.strided(max(1, round(lag_ps / run.lag_ps))) for run in (first, second))
+    baseline = Baseline.of(first, probing=False)
+    return HeldOut(scene, baseline, baseline.measure(first), baseline.measure(second))
+
+
+def compare_frames(
+    frames: Frames, ref: HeldOut, *, seed: int = 0, slowest: int | None = None
+) -> tuple[dict[str, Any], EquivalentTime]:
+    """Return what replicas `(rows, n_frames, n_atoms, 3)` nm get wrong, JSON-able, and their equivalent MD time by the
+    φ/ψ map.
+
+    `jsd`: Jensen-Shannon distance of the joint φ/ψ histograms (50 x 50, overflow bins), the root mean square of those
+    to the two held-out runs; shares of valid frames; the autocorrelation of cos ψ after one frame and its relaxation
+    time. Numbers with intervals are dictionaries of `comparison.statistics.Estimate`. `slow_relaxation_ps`: of the
+    torsion `slowest`, where one is named (`slowest_torsion`). Raises InputError where frames are too few.
+    """
+    rolled = Ensemble("rollout", [x.astype(np.float32) for x in frames], ref.reference.lag_ps, ref.scene)
+    features = ref.baseline.measure(rolled)
+    found = joint_measure(ref.reference, features, ref.replicate, ref.baseline.torsions)
+    if found is None or (equivalent_time := equivalent_time_by(*found, seed)) is None:
+        raise InputError("too few frames to tell an error; give longer references, or a longer `time_ps`.")
+    sample = _sample(features, ref, seed)
+    correlation, relaxation = relaxation_of(sample)
+    out: dict[str, Any] = {
+        "jsd": distance_to_reference(found[0], seed).to_dict(),
+        "correlation": correlation.to_dict(),
+        "relaxation_ps": relaxation.to_dict(),
+    }
+    if slowest is not None:
+        out["slow_relaxation_ps"] = relaxation_of(sample, slowest)[1].to_dict()
+    for key, mask in CHECKS.items():
+        inside, total = block_occupancy([(f & mask) == 0 for f in features.flags], sample.blocks)
+        draws = 100.0 * (sample.weights @ inside) / (sample.weights @ total)
+        out[key] = estimate(100.0 * float(inside.sum() / total.sum()), draws, sample.blocks.n_blocks).to_dict()
+    return out, equivalent_time
+
+
+def compare_reference(ref: HeldOut, *, seed: int = 0) -> dict[str, Any]:
+    """Return what rollouts are compared with: the errors of MD of each length, the replicate baseline (the two runs
+    against each other), and the reference's own autocorrelation and relaxation time."""
+    found = joint_measure(ref.reference, ref.replicate, ref.replicate, ref.baseline.torsions)
+    if found is None or (equivalent_time := equivalent_time_by(*found, seed)) is None:
+        raise InputError("the references are too short to tell the error of MD; give longer ones.")
+    samples = [_sample(features, ref, seed) for features in (ref.reference, ref.replicate)]
+    kinetic = [[e.to_dict() for e in relaxation_of(sample)] for sample in samples]
+    return {
+        "length_ps": ref.length_ps,
+        "lengths_ps": list(equivalent_time.lengths_ps),
+        "errors": list(equivalent_time.errors),
+        "errors_low": list(equivalent_time.errors_low),
+        "errors_high": list(equivalent_time.errors_high),
+        "replicate_baseline": equivalent_time.errors[-1],
+        "correlation": [pair[0] for pair in kinetic],
+        "relaxation_ps": [pair[1] for pair in kinetic],
+        "slowest": slowest_torsion(samples),
+    }
+
+
+def equivalent_time_row(equivalent_time: EquivalentTime, spent_s: float, md_s_per_ns: float) -> dict[str, Any]:
+    """Return the equivalent MD time of a rollout; what so much MD takes, over `spent_s` (`times_faster`, with the ends
+    of its interval); and the error of as many seconds of MD, None where that is shorter than any MD at hand."""
+    row: dict[str, Any] = {"equivalent_time": {"words": equivalent_time.in_words(), "bound": equivalent_time.bound}}
+    for end, name in (("", "equivalent_ps"), ("_low", "low_ps"), ("_high", "high_ps")):
+        time_ps = getattr(equivalent_time, name)
+        row["equivalent_time"][name] = time_ps
+        row[f"times_faster{end}"] = None if time_ps is None else 1e-3 * time_ps * md_s_per_ns / spent_s
+    md_ps = 1e3 * spent_s / md_s_per_ns
+    is_at_hand = md_ps >= equivalent_time.lengths_ps[0]
+    row["md_of_same_seconds"] = equivalent_time.error_at(md_ps / equivalent_time.lengths_ps[-1]) if is_at_hand else None
+    return row
+
+
+def _sample(features: Features, ref: HeldOut, seed: int) -> Sample:
+    each = block_length(features.n_frames, longest_correlation(ref.reference))
+    return make_sample(features, make_blocks(features.segment_lengths, each), Options(seed=seed), 1)
+
+
+# ---- effective samples ----------------------------------------------------------------------------------------------
+
+
+def slowest_torsion(samples: Sequence[Sample]) -> dict[str, Any] | None:
+    """Return the torsion that effective samples are counted by, JSON-able: its place in `relaxation_rows.turning`, its
+    name, its relaxation time in ps over all of MD `samples`, how many of them these hold. None where none relaxes often
+    enough."""
+    found: list[dict[str, Any]] = []
+    total_ps = sum(sample.features.total_ps for sample in samples)
+    for k, (symbol, label, _) in enumerate(turning(samples[0].features)):
+        times = [relaxation_of(sample, k)[1].value for sample in samples]
+        if all(math.isfinite(time) and time > 0 for time in times):
+            tau_ps = sum(times) / len(times)
+            name = f"cos {symbol or label}".strip()
+            found.append({"torsion": k, "name": name, "tau_ps": tau_ps, "samples": total_ps / (2.0 * tau_ps)})
+    enough = [one for one in found if one["samples"] >= LEAST_SAMPLES]
+    return max(enough, key=lambda one: float(one["tau_ps"])) if enough else None
+
+
+def samples_per_second(cpu_s_per_ns: float, tau_ps: float | None, md_tau_ps: float) -> float | None:
+    """Return effective samples a processor second; None where the model's own relaxation time is not known."""
+    if tau_ps is None or not math.isfinite(tau_ps):
+        return None
+    return 1e3 / cpu_s_per_ns / (2.0 * max(tau_ps, md_tau_ps))
+
+
+def effective_row(row: dict[str, Any], md: dict[str, Any]) -> dict[str, Any]:
+    """Return the effective samples a second of a setting that was rolled (`row`), and these over those of OpenMM."""
+    slow = md.get("slowest")
+    if slow is None or "slow_relaxation_ps" not in row:
+        return {}
+    rate = samples_per_second(row["cpu_s_per_ns"]["mean"], row["slow_relaxation_ps"]["value"], slow["tau_ps"])
+    md_s_per_ns = next(cost["cpu_s_per_ns"]["mean"] for cost in md["cost"] if cost["way"] != SIMD)
+    over_md = None if rate is None else rate * md_s_per_ns * 2e-3 * slow["tau_ps"]
+    return {"effective_per_s": rate, "effective_over_md": over_md}
 
 
 # ---- held-out reference ---------------------------------------------------------------------------------------------
@@ -232,13 +388,12 @@ def refuse_trained_on(
         frames.refuse_leaks()
     except InputError as error:
         raise InputError(f"reference and replicate must be runs of their own, and share motion: {error}") from error
-    known = {key: domain.conditions.get(key) for key in frames.conditions}
-    other_key = next((key for key, value in frames.conditions.items() if value != known[key]), None)
-    if other_key is not None:
-        raise InputError(
-            f"{reference[0]} has {other_key} {frames.conditions[other_key]}, {name} was trained for "
-            f"{known[other_key]}: no reference to compare it with."
-        )
+    for key, value in frames.conditions.items():
+        if value != domain.conditions.get(key):
+            raise InputError(
+                f"{reference[0]} has {key} {value}, {name} was trained for {domain.conditions.get(key)}: no reference "
+                "to compare it with."
+            )
     compared_ps = lag_ps or frames.lag_ps
     for step_ps, what in ((frames.lag_ps, f"frames of {reference[0]}"), (domain.lag_ps, f"steps of {name}")):
         if round(compared_ps / step_ps) < 1 or abs(compared_ps / step_ps - round(compared_ps / step_ps)) > 1e-6:
@@ -264,3 +419,144 @@ def _sources(provenance: dict[str, Any]) -> Iterator[dict[str, Any]]:
     yield from provenance.get("sources", ())
     if isinstance(provenance.get("from"), dict):
         yield from _sources(provenance["from"])
+
+
+# ---- the page -------------------------------------------------------------------------------------------------------
+
+
+def write_cost_error(result: dict[str, Any], folder: Path) -> None:
+    """Write cost_error.json, .md and, where a setting was measured, .svg. Raises StorageError."""
+    create_whole(folder / "cost_error.json", json.dumps(result, indent=1))
+    create_whole(folder / "cost_error.md", markdown(result))
+    if any("jsd" in row for row in result["rows"]):
+        create_whole(folder / "cost_error.svg", lambda path: plot(result, path))
+
+
+def markdown(result: dict[str, Any]) -> str:
+    """Return the tables: MD and the settings."""
+    md, config = result["md"], result["config"]
+    correlation, relaxation_ps = (
+        np.mean([run["value"] for run in md[key]]) for key in ("correlation", "relaxation_ps")
+    )
+    columns = (md[key] for key in ("lengths_ps", "errors", "errors_low", "errors_high"))
+    by_length = "; ".join(
+        f"{1e-3 * ps:.3g} ns {error:.3f} [{low:.3f}, {high:.3f}]" for ps, error, low, high in zip(*columns, strict=True)
+    )
+    slow, counted = (
+        md["slowest"],
+        "No torsion relaxes 50 times over in the MD at hand: effective samples are not counted.",
+    )
+    if slow is not None:
+        counted = (
+            f"Effective samples: simulated time over 2 max(τ, τ of MD) of {slow['name']} (MD: {slow['tau_ps']:.1f} ps, "
+            f"{slow['samples']:.0f} of them at hand), a processor second; over OpenMM's."
+        )
+    md_rows = [
+        {"MD": cost["label"], "s/ns": _range(cost["cpu_s_per_ns"]), "wall s/ns": cost["wall_s_per_ns"]["mean"]}
+        for cost in md["cost"]
+    ]
+    return "\n".join(
+        [
+            f"# Run time against error: {result['scene']}",
+            "",
+            f"Rollouts of {1e-3 * config['time_ps']:g} ns in all replicas, against two held-out runs of "
+            f"{1e-3 * md['length_ps']:g} ns; processor seconds on {config['threads']} thread(s), mean of "
+            f"{config['rounds']} parts [least, greatest]; 95 % intervals in brackets elsewhere.",
+            "",
+            result["machine"]["about"],
+            "",
+            "## MD",
+            "",
+            *markdown_table(md_rows),
+            "",
+            f"JSD of MD by length, typical piece [10 %, 90 % of pieces]: {by_length}.",
+            "",
+            "## Settings",
+            "",
+            *markdown_table([_row(row, md["errors"][0]) for row in result["rows"]]),
+            "",
+            "JSD: Jensen-Shannon distance of the joint φ/ψ map (50 x 50) to the held-out runs, root mean square; "
+            f"{md['replicate_baseline']:.3f} is what these have between them, and nothing below is claimed. MD, "
+            "same seconds: the JSD of as many processor seconds of OpenMM at 4 fs. Equivalent MD time: how much MD "
+            "is as far from the reference; faster: what that MD takes, over what the rollout took. C1: autocorrelation "
+            f"of cos ψ after one frame (reference {correlation:.3f}), τ: its relaxation time (reference "
+            f"{relaxation_ps:.1f} ps).",
+            "",
+            counted,
+            "",
+        ]
+    )
+
+
+def _row(row: dict[str, Any], shortest: float) -> dict[str, Any]:
+    """Return the cells of a setting; `shortest` is the error of the shortest MD at hand."""
+    out: dict[str, Any] = {"weights": row["weights"], "setting": row["label"]}
+    if "outcome" in row:
+        return out | {"evaluations": row["outcome"]}
+    bound = {"at least": "≥ ", "less than": "< "}.get(row["equivalent_time"]["bound"], "")
+    faster = [row[f"times_faster{end}"] for end in ("", "_low", "_high")]
+    same, over_md = row["md_of_same_seconds"], row.get("effective_over_md")
+    return out | {
+        "evaluations": f"{row['evaluations']:.3g}",
+        "s/ns": _range(row["cpu_s_per_ns"]),
+        "wall s/ns": f"{row['wall_s_per_ns']['mean']:.3g}",
+        "x MD 4 fs": _range(row["speed_over_md"]),
+        "0.5 Å %": f"{row['valid_half_angstrom_%']['value']:.2f}",
+        "20 % %": f"{row['bonds_20_percent_%']['value']:.2f}",
+        "JSD": _interval([row["jsd"][key] for key in ("value", "low", "high")], ".3f"),
+        "MD, same seconds": f"> {shortest:.3f}" if same is None else f"{same:.3f}",
+        "equivalent MD time": row["equivalent_time"]["words"],
+        "faster": f"{bound}{faster[0]:.2g}" if bound else _interval(faster, ".2g"),
+        "C1": "none" if row["correlation"]["value"] is None else f"{row['correlation']['value']:.3f}",
+        "τ / ps": _interval([row["relaxation_ps"][key] for key in ("value", "low", "high")], ".1f"),
+        "effective samples": "" if over_md is None else f"{row['effective_per_s']:.3g}/s, {over_md:.3g} x MD",
+    }
+
+
+def _range(spread: dict[str, float]) -> str:
+    return _interval([spread["mean"], spread["least"], spread["greatest"]], ".3g")
+
+
+def _interval(found: Sequence[float | None], digits: str) -> str:
+    """Return a value with the ends of its interval, such as '0.31 [0.28, 0.35]'; without them where none is known."""
+    value, *ends = ("..." if each is None else f"{each:{digits}}" for each in found)
+    return f"{value} [{', '.join(ends)}]" if found[1:] != [None, None] else value
+
+
+def plot(result: dict[str, Any], path: Path) -> None:
+    """Draw error against processor seconds, logarithmic: MD of every length, and each setting."""
+    from matplotlib.figure import Figure
+    from matplotlib.ticker import FixedLocator, ScalarFormatter
+
+    figure = Figure(figsize=(8.2, 5.4), layout="constrained")
+    axes = figure.add_subplot()
+    md = result["md"]
+    cost = next(cost for cost in md["cost"] if cost["way"] == OPENMM)
+    x = 1e-3 * np.asarray(md["lengths_ps"]) * cost["cpu_s_per_ns"]["mean"]
+    axes.plot(x, md["errors"], color="black", lw=1.4, label=cost["label"])
+    axes.fill_between(x, md["errors_low"], md["errors_high"], color="black", alpha=0.1, lw=0)
+    axes.axhline(md["replicate_baseline"], color="black", lw=0.8, alpha=0.5)
+    text = f"two runs of {1e-3 * md['length_ps']:g} ns"
+    axes.annotate(text, (0.01, md["replicate_baseline"]), xycoords=("axes fraction", "data"), va="bottom", fontsize=8)
+    labelled = set()
+    for row in (row for row in result["rows"] if "jsd" in row):
+        colour = _COLOURS.get(row["solver"], "#2ca02c")
+        is_sound = row["valid_half_angstrom_%"]["value"] >= SOUND_PERCENT
+        at = row["spent_s"], row["jsd"]["value"]
+        low, high = (at[1] if row["jsd"][end] is None else row["jsd"][end] for end in ("low", "high"))
+        bar = [[max(at[1] - max(low, 0.5 * at[1]), 0.0)], [max(high - at[1], 0.0)]]
+        axes.errorbar(*at, bar, fmt="o", color=colour, lw=0.7, mfc=colour if is_sound else "white", zorder=3,
+                      label=None if row["solver"] in labelled else row["solver"] or "surrogate")  # fmt: skip
+        labelled.add(row["solver"])
+        axes.annotate(row["label"].removeprefix(f"{row['solver']} "), at, xytext=(5, 3), textcoords="offset points",
+                      fontsize=7.5, color=colour)  # fmt: skip
+    axes.set(xscale="log", yscale="log", xlabel="processor time / s (one core)",
+             ylabel="Jensen-Shannon distance of the φ/ψ map to held-out MD",
+             title=f"{result['scene']}: run time against error")  # fmt: skip
+    axes.yaxis.set_major_locator(FixedLocator([0.02, 0.03, 0.05, 0.07, 0.1, 0.15, 0.2, 0.3, 0.4, 0.5, 0.6, 0.8]))
+    axes.yaxis.set_major_formatter(ScalarFormatter())
+    axes.yaxis.set_minor_locator(FixedLocator([]))
+    axes.grid(alpha=0.25, which="major")
+    axes.plot([], [], "o", color="grey", mfc="white", label=f"under {SOUND_PERCENT:g} % of frames whole")
+    axes.legend(frameon=False, fontsize=8.5, title="numbers: solver steps", title_fontsize=8)
+    figure.savefig(path, format="svg", dpi=140)

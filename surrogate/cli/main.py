@@ -1,24 +1,26 @@
 """The command line: parsing and printing only. Every verb is one call of `surrogate.api`, which is loaded when it runs;
-`bench` and `stress` are calls of `surrogate.bench`."""
+`bench` is a call of `surrogate.bench`."""
 
 from __future__ import annotations
 
 import atexit
+import functools
 import gc
+import inspect
+import logging
 import os
 import sys
 import warnings
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, is_dataclass
+from enum import StrEnum
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, cast, get_type_hints
 
 import typer
 from typer.core import TyperGroup
 
 import surrogate as sm
-from surrogate.bench.bench_options import CostErrorOptions, StressOptions
-from surrogate.cli.parameters import JsonOpt, OutOpt, SceneArg, WeightsOpt, literal, usage_error, with_options
 from surrogate.cli.render import (
     as_flags,
     print_comparison,
@@ -31,6 +33,7 @@ from surrogate.cli.render import (
 from surrogate.verbs.options import (
     CampaignOptions,
     CompareOptions,
+    CostErrorOptions,
     DemoOptions,
     PlanOptions,
     Quiet,
@@ -44,10 +47,141 @@ from surrogate.verbs.options import (
 from systems.errors import SurromdError
 from systems.files.outside import printable
 from systems.interrupts import interrupted_by_signals
-from systems.options import option
+from systems.options import MissingOptionError, Option, gather, option, options_of
 
 # Of objects since the last look for garbage, before there is another.
 _YOUNG_OBJECTS = 50_000
+
+
+# ---- arguments and options that several verbs share ----------------------------------------------------------------
+
+
+def literal(text: str) -> str:
+    """Return a help text in which brackets are what they look like: typer and rich take `[default: 4fs]` for markup and
+    show nothing of it."""
+    return text.replace("[", "\\[")
+
+
+def _scenes(incomplete: str) -> list[str]:
+    """Return the library's names that begin so, for a shell that completes the word."""
+    from systems.library.named_scenes import names
+
+    return [name for name in names() if name.startswith(incomplete)]
+
+
+def _weights(incomplete: str) -> list[str]:
+    from surrogate.models.architecture import shipped_weights
+
+    return [name for name in shipped_weights() if name.startswith(incomplete)]
+
+
+SceneArg = Annotated[
+    str,
+    typer.Argument(
+        metavar="SCENE", help="Library name, path, smiles:CCO or sequence:ACE-ALA-NME.", autocompletion=_scenes
+    ),
+]
+WeightsOpt = Annotated[
+    str | None,
+    typer.Option(
+        "--weights",
+        help="Shipped weights by name, or a .safetensors file (default: those that cover SCENE).",
+        autocompletion=_weights,
+    ),
+]
+OutOpt = Annotated[Path, typer.Option("--out", "-o", help="Output trajectory (.h5, .dcd or .xtc).")]
+FolderOpt = Annotated[Path, typer.Option("--out", "-o", help="Output folder.")]
+
+
+# Click's own exceptions, which end in its own messages and exit codes; typer 0.26 and newer bring a click of their own.
+_CLICK: dict[str, Any] = {kind.__name__: kind for kind in typer.BadParameter.__mro__}
+_USAGE_ERRORS = (_CLICK["ClickException"], typer.Exit, typer.Abort)
+
+
+def usage_error(message: str, context: Any = None) -> Exception:
+    """Return click's error that ends a command with its usage, a message and exit code 2."""
+    made: Exception = _CLICK["UsageError"](message, context)
+    return made
+
+
+JsonOpt = Annotated[bool, typer.Option("--json", help="Print the result as JSON to stdout.")]
+
+
+def with_options(command: Callable[..., None]) -> Callable[..., None]:
+    """Return a command with an option of the command line for each that its dataclasses of options declare.
+
+    A parameter of such a type (`options: RolloutOptions`) becomes all of them, in its place, and `--config FILE`, which
+    what stands on the command line comes before. Names and units are those of `systems.options`.
+    """
+    hints = get_type_hints(command, include_extras=True)
+    shown: list[inspect.Parameter] = []
+    kinds: dict[str, type] = {}
+    for parameter in inspect.signature(command).parameters.values():
+        hint = hints[parameter.name]
+        if is_dataclass(hint):
+            kinds[parameter.name] = cast(Any, hint)
+            known = options_of(cast(type, hint)).values()
+            shown += [_parameter(each) for each in known if each.flags]
+            shown.append(_keyword("config", Path, _config_option(known)))
+        else:
+            shown.append(parameter.replace(annotation=hint, kind=inspect.Parameter.KEYWORD_ONLY))
+
+    @functools.wraps(command)
+    def run(**given: Any) -> None:
+        for name, kind in kinds.items():
+            try:
+                resolved = _resolved(kind, given)
+            except MissingOptionError as error:
+                raise usage_error(f"{command.__name__} {error.needs}") from None
+            # Such as the lines about charges.
+            logging.getLogger("surromd").setLevel(
+                logging.ERROR if getattr(resolved, "quiet", False) else logging.NOTSET
+            )
+            given[name] = resolved
+        command(**given)
+
+    run.__signature__ = inspect.Signature(shown)  # type: ignore[attr-defined]
+    run.__annotations__ = {parameter.name: parameter.annotation for parameter in shown}
+    return run
+
+
+def _config_option(known: Iterable[Option]) -> Any:
+    """Return `--config`, whose help names the tables of the file."""
+    tables = dict.fromkeys(found.section or found.name for found in known if found.section or found.kind is dict)
+    listed = "".join(f", [{table}]" for table in tables)
+    return typer.Option("--config", help=literal(f"TOML of these options{listed}; what is given here comes first."))
+
+
+def _resolved(kind: type, given: dict[str, Any]) -> Any:
+    """Take a dataclass's options out of what the command line gives, and return it. Raises what `gather` does."""
+
+    def plain(value: Any) -> Any:
+        return [plain(one) for one in value] if isinstance(value, list) else getattr(value, "value", value)
+
+    typed = {name: given.pop(name) for name, found in options_of(kind).items() if found.flags}
+    values = {name: plain(value) for name, value in typed.items() if value is not None and value != []}
+    return gather(kind, values, file=given.pop("config"), naming=lambda found: found.flags[0])
+
+
+def _keyword(name: str, kind: Any, declared: Any) -> inspect.Parameter:
+    annotation = Annotated[kind | None, declared]
+    return inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=None, annotation=annotation)
+
+
+def _parameter(found: Option) -> inspect.Parameter:
+    """Return an option as typer takes it: None where it is left out, so that a file may give it."""
+    kind: Any = str if found.reader is not None else found.kind
+    if found.choices:
+        enumeration: Any = StrEnum  # called by its functional form, which mypy takes with literal names alone
+        kind = enumeration(found.name, {choice: choice for choice in found.choices})
+    default = "required" if found.required else f"default: {text}" if (text := found.shown_default) else ""
+    least, most = found.within if kind in (int, float) else (None, None)
+    shown = literal(f"{found.help} [{default}]" if default else found.help)
+    declared = typer.Option(*found.flags, help=shown, min=least, max=most, show_default=False)
+    return _keyword(found.name, list[kind] if found.many else kind, declared)
+
+
+# ---- the program ---------------------------------------------------------------------------------------------------
 
 
 class _Group(TyperGroup):
@@ -69,18 +203,12 @@ class _Group(TyperGroup):
             _fail(f"error: {_os_error(error)}", 1)
         except MemoryError:
             _fail("error: out of memory; ask for fewer frames or replicas at once", 1)
-        except _usage_errors() as error:
+        except _USAGE_ERRORS as error:
             raise (_needed(error) or error) from None
         except Exception as error:  # a fault of ours: one line for the user, the rest on demand
             if "null byte" in str(error):
                 _fail("error: a path holds a NUL character, which no file's name can have", 1)
             _fail(f"error: unexpected {type(error).__name__}: {error} (a bug; SURROMD_DEBUG=1 shows where)", 1)
-
-
-def _usage_errors() -> tuple[type[BaseException], ...]:
-    """Click's own exceptions, which end in its own messages and exit codes (typer 0.26 and newer vendor click)."""
-    usage = next(c for c in typer.BadParameter.__mro__ if c.__name__ == "ClickException")
-    return (usage, typer.Exit, typer.Abort)
 
 
 def _needed(error: Any) -> Exception | None:
@@ -136,7 +264,7 @@ def _surromd(
 @app.command()
 @with_options
 def demo(
-    out: Annotated[Path, typer.Option("--out", "-o", help="Output folder.")] = Path("surromd-demo"),
+    out: FolderOpt = Path("surromd-demo"),
     *,
     options: DemoOptions,
 ) -> None:
@@ -323,11 +451,6 @@ def info(
 # ---- benchmarks -----------------------------------------------------------------------------------------------------
 
 
-@bench.callback()
-def _benchmarks() -> None:
-    """Keep `bench` a group, however many benchmarks it has."""
-
-
 @bench.command(name="cost-error")
 @with_options
 def cost_error(
@@ -336,7 +459,7 @@ def cost_error(
     weights: Annotated[
         list[str], typer.Option("--weights", "-w", help="Weights by name or .safetensors file; repeatable.")
     ],
-    out: Annotated[Path, typer.Option("--out", "-o", help="Output folder.")] = Path("cost-error"),
+    out: FolderOpt = Path("cost-error"),
     *,
     options: CostErrorOptions,
     as_json: JsonOpt = False,
@@ -345,58 +468,21 @@ def cost_error(
 
     REFERENCE and REPLICATE: two runs that the weights were not trained on.
     """
-    from surrogate.bench.cost_error import cost_error as run
-    from surrogate.bench.cost_page import markdown
+    from surrogate.bench import cost_error as bench
 
-    report = _reporting(options.quiet or as_json)
-    result = run(reference, replicate, weights, out, options, report=report)
-    files = f"{out}: cost_error.json, cost_error.md, cost_error.svg"
-    _print_tables(result, markdown, files, as_json=as_json, quiet=options.quiet)
-
-
-@app.command()
-@with_options
-def stress(
-    weights: Annotated[str, typer.Argument(metavar="WEIGHTS", help="Name of shipped weights, or a .safetensors file.")],
-    out: Annotated[Path, typer.Option("--out", "-o", help="Output folder.")] = Path("surromd-stress"),
-    *,
-    options: StressOptions,
-    as_json: JsonOpt = False,
-) -> None:
-    """Stress-test WEIGHTS: long rollouts, unusual inputs, precision, solvers, beside OpenMM."""
-    from surrogate.bench.stress import choose_config, stress_weights
-    from surrogate.bench.stress_page import markdown
-
-    report = _reporting(options.quiet or as_json)
-    result = stress_weights(weights, out, choose_config(options), scene=options.scene, report=report)
-    _print_tables(result, markdown, f"{out}: stress.json, stress.md", as_json=as_json, quiet=options.quiet)
-
-
-def _reporting(quiet: bool) -> Callable[[str], None]:
-    return lambda line: None if quiet else typer.echo(f"running: {line}", err=True)
-
-
-def _print_tables(result: Any, markdown: Callable[[Any], str], files: str, *, as_json: bool, quiet: bool) -> None:
-    """Print what a benchmark has found, and which files it has written."""
+    is_quiet = options.quiet or as_json
+    result = bench.cost_error(
+        reference, replicate, weights, out, options,
+        report=lambda line: None if is_quiet else typer.echo(f"running: {line}", err=True),
+    )  # fmt: skip
     if as_json:
         print_json(result)
-    elif not quiet:
-        typer.echo(markdown(result))
-        typer.echo(files)
+    elif not options.quiet:
+        typer.echo(bench.markdown(result))
+        typer.echo(f"{out}: cost_error.json, .md and .svg")
 
 
 # ---- the process ----------------------------------------------------------------------------------------------------
-
-
-def _hush_readers() -> None:
-    """Keep warnings of MDTraj and MDAnalysis from the terminal: what matters in a file our readers say, in a line."""
-    show = warnings.showwarning
-
-    def shown(message: Any, category: Any, filename: str, *where: Any, **more: Any) -> None:
-        if not {"mdtraj", "MDAnalysis"} & set(Path(filename).parts):
-            show(message, category, filename, *where, **more)
-
-    warnings.showwarning = shown
 
 
 def main() -> None:
@@ -409,7 +495,8 @@ def main() -> None:
     gc.set_threshold(_YOUNG_OBJECTS)
     atexit.register(gc.freeze)
     if os.environ.get("SURROMD_DEBUG") != "1":
-        _hush_readers()
+        # What matters in a file our readers say, in a line.
+        warnings.filterwarnings("ignore", module="mdtraj|MDAnalysis")
     try:
         with interrupted_by_signals():
             app(prog_name="surromd")

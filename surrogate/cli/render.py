@@ -11,8 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import typer
 
-from surrogate.bench.bench_options import CostErrorOptions, StressOptions
-from surrogate.verbs.options import VERB_OPTIONS
+from surrogate.verbs.options import VERB_OPTIONS, CostErrorOptions
 from systems.files.outside import printable
 from systems.options import Option, options_of
 
@@ -29,7 +28,7 @@ _ARGUMENTS = {"out": "--out", "weights": "--weights", "config": "--config"}
 @cache
 def _known() -> dict[str, Option]:
     # Of a name that several have the last one counts.
-    kinds = [CostErrorOptions, StressOptions, *VERB_OPTIONS.values()]
+    kinds = [CostErrorOptions, *VERB_OPTIONS.values()]
     return {name: found for kind in kinds for name, found in options_of(kind).items()}
 
 

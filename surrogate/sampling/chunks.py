@@ -29,7 +29,8 @@ from surrogate.data import fitted_atoms
 from surrogate.models.layers import with_compiled_parts, with_lean_parts
 from surrogate.models.potential import Potential
 from surrogate.models.propagator import Propagator, draw_noise
-from surrogate.sampling.coupling import Coupling, EnergyCheck, MemberSpread
+from surrogate.sampling.config import RolloutConfig
+from surrogate.sampling.coupling import Coupling, PotentialChecks
 from surrogate.training.devices import choose_precision, keep_freed_memory, torch_threads
 from systems.chemistry import validity
 from systems.chemistry.geometry import superposition
@@ -260,13 +261,8 @@ def caught(flags: Flags) -> npt.NDArray[np.bool_]:
 
 
 # The column `intervention` of a trajectory: what a frame is, if it is not the surrogate's first draw.
-DRAWN_AGAIN, REPAIRED, MD_AFTER_FAILURE, MD_BETWEEN = 1, 2, 3, 4
-MARKS = {
-    DRAWN_AGAIN: "drawn again",
-    REPAIRED: "repaired",
-    MD_AFTER_FAILURE: "MD after a failure",
-    MD_BETWEEN: "MD between chunks",
-}
+DRAWN_AGAIN, REPAIRED, MD_AFTER_FAILURE = 1, 2, 3
+MARKS = {DRAWN_AGAIN: "drawn again", REPAIRED: "repaired", MD_AFTER_FAILURE: "MD after a failure"}
 # What frames of each kind may do to the statistics of a trajectory.
 BIAS = {
     DRAWN_AGAIN: "states from which the surrogate fails are visited less, and left in other ways",
@@ -274,9 +270,7 @@ BIAS = {
     "ensemble's",
     MD_AFTER_FAILURE: "MD stands where the surrogate failed: ensemble and kinetics are a mixture, and each stretch of "
     "MD starts from a relaxed frame with new velocities and warms up within about 1 ps",
-    MD_BETWEEN: "MD stands between chunks: ensemble and kinetics are a mixture of the two",
 }
-_LOGGED = 200
 
 
 @dataclass
@@ -286,7 +280,7 @@ class Tally:
     `chunks` drawn, of which `chunks_caught` held a frame that a guard caught; `frames_caught` and `reasons` count the
     frames of first draws, `frames` those that an intervention left, `draws` the further draws. `md_in_a_row`: chunks
     that MD had to finish since the surrogate last got through one. `invalid_in_a_row`: frames of the chunks since the
-    last one that held a valid frame. `log` holds the first 200 interventions.
+    last one that held a valid frame.
     """
 
     chunks: int = 0
@@ -297,17 +291,14 @@ class Tally:
     draws: int = 0
     md_in_a_row: int = 0
     invalid_in_a_row: int = 0
-    log: list[dict[str, Any]] = field(default_factory=list)
 
-    def note_caught(self, flags: npt.NDArray[np.uint16], first_step: int) -> None:
-        """Enter the caught frames of a first draw, `flags (k,)` each with its bits; `first_step` is the earliest's."""
+    def note_caught(self, flags: npt.NDArray[np.uint16]) -> None:
+        """Enter the caught frames of a first draw, `flags (k,)` each with its bits."""
         self.chunks_caught += 1
         self.frames_caught += len(flags)
         names = Counter(name for bits in flags.tolist() for name in validity.flag_names(bits))
         for name, count in names.items():
             self.reasons[name] = self.reasons.get(name, 0) + count
-        if len(self.log) < _LOGGED:
-            self.log.append({"chunk": self.chunks, "step": first_step, "reasons": sorted(names)})
 
     def note_marks(self, marks: npt.NDArray[np.uint8]) -> None:
         """Enter what the frames of a finished chunk are, `marks (n,)`."""
@@ -338,7 +329,7 @@ _DRAWS_FROM_LAST_VALID = 4
 MOST_MD_IN_A_ROW = 10
 # Invalid frames, after which unguarded rollouts end: a clash passes, a molecule that came apart does not.
 MOST_INVALID_IN_A_ROW = 4
-_MD_ATTEMPT, _BETWEEN_ATTEMPT = 1000, 2000
+_MD_ATTEMPT = 1000
 # Under 'flag': so many chunks of each replica a model has to get one through. A frame now and then, as sound weights
 # have in long chunks, does not prove it wrong: of frames, so many must be caught, and more than one.
 _CHUNKS_TO_PROVE = 8
@@ -348,7 +339,7 @@ _WRONG_SHARE = 0.1
 @dataclass(eq=False)
 class Chunk:
     """Frames of all replicas: positions `(b, n, n_atoms, 3)` nm; flags, marks (`MARKS`) and, where they were
-    computed, what the energy check found in kJ/mol, `(b, n)`; velocities `(b, n_atoms, 3)` nm/ps at the end, of a model
+    computed, energy differences in kJ/mol, `(b, n)`; velocities `(b, n_atoms, 3)` nm/ps at the end, of a model
     that carries them, NaN where they are unknown. `failure`: why the rollout cannot go on, and in which replica."""
 
     frames_nm: FloatArray
@@ -357,6 +348,29 @@ class Chunk:
     energies_kj_mol: npt.NDArray[np.float64]
     velocities_nm_ps: FloatArray | None
     failure: tuple[int, str] | None = None
+
+
+@dataclass
+class Progress:
+    """Where a rollout stands between two chunks.
+
+    `last_frames (replicas, n_conditioning, n_atoms, 3)` nm, in the model's atom order and the user's pose, relative to
+    where the scene's centre was; `velocities (replicas, n_atoms, 3)` nm/ps of a model that carries them. `steps`: model
+    frames done, kept or not. `batch`: replicas computed at once, if memory has run out before. `drawn`: chunks drawn of
+    all replicas, further draws included, which took `evaluations` of the network together.
+    """
+
+    last_frames: npt.NDArray[np.float32]
+    velocities: npt.NDArray[np.float32] | None = None
+    chunks: int = 0
+    steps: int = 0
+    wall_s: float = 0.0
+    batch: int | None = None
+    drawn: int = 0
+    evaluations: float = 0.0
+    # Wall seconds of the batch by what they went into: draw, check, draw again, relax, md, energy.
+    seconds: dict[str, float] = field(default_factory=dict)
+    tallies: list[Tally] = field(default_factory=list)
 
 
 def none_through(tallies: Sequence[Tally], n_new: int, *, at_end: bool) -> tuple[int, str] | None:
@@ -378,71 +392,49 @@ def none_through(tallies: Sequence[Tally], n_new: int, *, at_end: bool) -> tuple
     return row, f"{which} was caught ({100 * frames / (chunks * n_new):.0f} % of frames: {named})"
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(eq=False)
 class Interventions:
-    """Draws chunks and treats frames that the checks caught as `guard` says (`surrogate.sampling.config.GUARDS`).
+    """Draws the chunks that follow `state` and treats frames that the checks caught as `config.guard` says
+    (`surrogate.sampling.config.GUARDS`). Tallies and seconds of the state are brought up to date.
 
-    `coupling` is needed by 'repair', 'fallback' and `n_between` (frames of MD after each chunk); `energy` checks every
-    `energy_every`-th frame, `spread` every frame of a learned potential.
+    `coupling` is needed by 'repair' and 'fallback'; `potential` checks the frames of a learned potential, and the
+    energy of every `config.energy_every`-th of them.
     """
 
     sampler: ChunkSampler
     checks: Guard
-    guard: str
-    seed: int
-    # Wall seconds of the batch by what they went into: draw, check, draw again, relax, md, energy, energy limit.
-    seconds: dict[str, float]
+    config: RolloutConfig
+    state: Progress
     coupling: Coupling | None = None
-    energy_every: int = 0
-    n_between: int = 0
-    energy: EnergyCheck | None = None
-    spread: MemberSpread | None = None
-
-    def advance(
-        self, last_nm: FloatArray, velocities_nm_ps: FloatArray | None, tallies: Sequence[Tally], *, chunk: int,
-        step: int,
-    ) -> Chunk:  # fmt: skip
-        """Return the chunk number `chunk` after `last_nm (b, n_conditioning, n_atoms, 3)`, `step` frames into the run.
-
-        Tallies are brought up to date. Frames are in it as they are to be written; where `failure` is set, the
-        rollout must stop.
-        """
-        run = _Advance(self, last_nm, velocities_nm_ps, tallies, chunk, step)
-        run.draw()
-        if self.guard not in ("off", "flag"):
-            run.help_rows()
-        run.compare()
-        if self.n_between and run.chunk.failure is None:
-            run.add_md()
-        for tally, marks in zip(tallies, run.chunk.marks, strict=True):
-            tally.note_marks(marks)
-            tally.chunks += 1
-        return run.chunk
-
-
-@dataclass(eq=False)
-class _Advance:
-    """One chunk in the making."""
-
-    plan: Interventions
-    last: FloatArray
-    velocities: FloatArray | None
-    tallies: Sequence[Tally]
-    number: int
-    step: int
+    potential: PotentialChecks | None = None
     chunk: Chunk = field(init=False)
 
+    def advance(self) -> Chunk:
+        """Return the next chunk, its frames as they are to be written; where `failure` is set, the rollout must
+        stop."""
+        self.draw()
+        if self.config.guard not in ("off", "flag"):
+            self.help_rows()
+        self.compare()
+        for tally, marks in zip(self.state.tallies, self.chunk.marks, strict=True):
+            tally.note_marks(marks)
+            tally.chunks += 1
+        return self.chunk
+
     def draw(self) -> None:
-        with timed(self.plan.seconds, "draw"):
-            drawn = self.plan.sampler.draw(self.last, self._seeds(range(len(self.last)), 0), self.velocities)
+        """Draw the chunk, check it, and enter the caught frames in the tallies."""
+        with timed(self.state.seconds, "draw"):
+            drawn = self.sampler.draw(
+                self.state.last_frames, self._seeds(range(len(self.state.last_frames)), 0), self.state.velocities
+            )
         shape = drawn.frames_nm.shape[:2]
         flags, marks = np.zeros(shape, dtype=np.uint16), np.zeros(shape, dtype=np.uint8)
         self.chunk = Chunk(drawn.frames_nm, flags, marks, np.full(shape, np.nan), drawn.velocities_nm_ps)
         self._check(np.arange(shape[0]))
-        for row, tally in enumerate(self.tallies):
+        for row, tally in enumerate(self.state.tallies):
             bad = np.flatnonzero(caught(self.chunk.flags[row]))
             if len(bad):
-                tally.note_caught(self.chunk.flags[row, bad], self.step + 1 + int(bad[0]))
+                tally.note_caught(self.chunk.flags[row, bad])
 
     def help_rows(self) -> None:
         """Replace caught frames by further draws, repair or MD; `chunk.failure` says which row could not be helped."""
@@ -460,7 +452,7 @@ class _Advance:
                 return
         first = pending[0]
         what = f"{MOST_DRAWS} further draws gave no chunk that passes ({self._reasons(first)})"
-        if self.tallies[first].md_in_a_row > MOST_MD_IN_A_ROW:
+        if self.state.tallies[first].md_in_a_row > MOST_MD_IN_A_ROW:
             what = f"MD had to finish {MOST_MD_IN_A_ROW} chunks in a row, and {what}"
         self.chunk.failure = (first, what)
 
@@ -469,55 +461,32 @@ class _Advance:
         for a whole chunk, or for as many short ones as hold MOST_INVALID_IN_A_ROW frames."""
         if self.chunk.failure is not None:
             return
-        for row in range(len(self.last)):
+        for row in range(len(self.state.last_frames)):
             if self.chunk.flags[row, -1] & validity.NOT_FINITE or not np.isfinite(self.chunk.frames_nm[row, -1]).all():
                 self.chunk.failure = (row, "the model's frames are no longer finite")
                 continue
             invalid = (self.chunk.flags[row] & np.uint16(validity.INVALID | validity.STILL)).all()
-            tally = self.tallies[row]
+            tally = self.state.tallies[row]
             tally.invalid_in_a_row = tally.invalid_in_a_row + self.chunk.flags.shape[1] if invalid else 0
-            if self.plan.guard == "flag" and tally.invalid_in_a_row >= MOST_INVALID_IN_A_ROW:
+            if self.config.guard == "flag" and tally.invalid_in_a_row >= MOST_INVALID_IN_A_ROW:
                 self.chunk.failure = (row, f"{tally.invalid_in_a_row} frames and no valid one ({self._reasons(row)})")
-
-    def add_md(self) -> None:
-        """Append a stretch of MD to every row."""
-        assert self.plan.coupling is not None
-        chunk, n = self.chunk, self.plan.n_between
-        starts = chunk.frames_nm[:, -1]
-        added = np.empty((len(starts), n, *starts.shape[1:]), dtype=chunk.frames_nm.dtype)
-        for row, start in enumerate(starts):
-            try:
-                with timed(self.plan.seconds, "md"):
-                    segment = self.plan.coupling.simulate(start, n, seed=self._seed(row, _BETWEEN_ATTEMPT))
-            except SimulationError as error:
-                chunk.failure = (row, f"MD cannot go on from the last frame of a chunk: {error}")
-                return
-            added[row] = segment.frames_nm
-            if chunk.velocities_nm_ps is not None:
-                chunk.velocities_nm_ps[row] = segment.velocities_nm_ps
-        flags = self.plan.checks.check(added, starts)
-        marks = np.full(flags.shape, MD_BETWEEN, dtype=np.uint8)
-        chunk.frames_nm = np.concatenate([chunk.frames_nm, added], axis=1)
-        chunk.flags = np.concatenate([chunk.flags, flags], axis=1)
-        chunk.marks = np.concatenate([chunk.marks, marks], axis=1)
-        chunk.energies_kj_mol = np.concatenate([chunk.energies_kj_mol, np.full(flags.shape, np.nan)], axis=1)
 
     def _resolve(self, row: int, attempt: int) -> bool:
         """Do what the guard says about a row that was just drawn; return whether it can stay as it is then. A first
         draw without a frame that passes is not worth it: there is another."""
         bad = np.flatnonzero(caught(self.chunk.flags[row]))
         if not len(bad):
-            self.tallies[row].md_in_a_row = 0
+            self.state.tallies[row].md_in_a_row = 0
             return True
         if attempt == 0 and self._none_passes(row):
             return False
-        if self.plan.guard == "repair":
+        if self.config.guard == "repair":
             return self._repair(row)
-        return self.plan.guard == "fallback" and self._fall_back(row, int(bad[0]))
+        return self.config.guard == "fallback" and self._fall_back(row, int(bad[0]))
 
     def _repair(self, row: int) -> bool:
         """Relax the caught frames of a row, first to last; return whether all of them are valid then."""
-        assert self.plan.coupling is not None
+        assert self.coupling is not None
         while True:
             bad = np.flatnonzero(caught(self.chunk.flags[row]))
             if not len(bad):
@@ -526,8 +495,8 @@ class _Advance:
             if self.chunk.marks[row, frame] == REPAIRED:
                 return False
             try:
-                with timed(self.plan.seconds, "relax"):
-                    relaxed = self.plan.coupling.relax(self.chunk.frames_nm[row, frame])
+                with timed(self.state.seconds, "relax"):
+                    relaxed = self.coupling.relax(self.chunk.frames_nm[row, frame])
             except SimulationError:
                 return False
             self.chunk.frames_nm[row, frame] = relaxed.positions_nm
@@ -537,17 +506,15 @@ class _Advance:
 
     def _fall_back(self, row: int, first: int) -> bool:
         """Replace a row from frame `first` on by MD; return whether it could be done."""
-        assert self.plan.coupling is not None
-        tally = self.tallies[row]
+        assert self.coupling is not None
+        tally = self.state.tallies[row]
         tally.md_in_a_row += 1
         if tally.md_in_a_row > MOST_MD_IN_A_ROW:
             return False
         n = self.chunk.frames_nm.shape[1] - first
         try:
-            with timed(self.plan.seconds, "md"):
-                segment = self.plan.coupling.simulate(
-                    self._history(row, first)[-1], n, seed=self._seed(row, _MD_ATTEMPT)
-                )
+            with timed(self.state.seconds, "md"):
+                segment = self.coupling.simulate(self._history(row, first)[-1], n, seed=self._seed(row, _MD_ATTEMPT))
         except SimulationError:
             return False
         self._replace(row, first, segment.frames_nm, MD_AFTER_FAILURE)
@@ -563,14 +530,14 @@ class _Advance:
         histories = np.stack([self._history(row, first) for row, first in zip(rows, firsts, strict=True)])
         velocities = None
         if self.chunk.velocities_nm_ps is not None:
-            velocities = np.full((len(rows), *self.last.shape[2:]), np.nan)
+            velocities = np.full((len(rows), *self.state.last_frames.shape[2:]), np.nan)
             for k, (row, first) in enumerate(zip(rows, firsts, strict=True)):
-                if first == 0 and self.velocities is not None:
-                    velocities[k] = self.velocities[row]
-        with timed(self.plan.seconds, "draw again"):
-            drawn = self.plan.sampler.draw(histories, self._seeds(rows, attempt), velocities)
+                if first == 0 and self.state.velocities is not None:
+                    velocities[k] = self.state.velocities[row]
+        with timed(self.state.seconds, "draw again"):
+            drawn = self.sampler.draw(histories, self._seeds(rows, attempt), velocities)
         for k, (row, first) in enumerate(zip(rows, firsts, strict=True)):
-            self.tallies[row].draws += 1
+            self.state.tallies[row].draws += 1
             self._replace(row, first, drawn.frames_nm[k, : drawn.frames_nm.shape[1] - first], DRAWN_AGAIN)
             if self.chunk.velocities_nm_ps is not None and drawn.velocities_nm_ps is not None:
                 # Those of the draw belong to its last frame, which is cut off where the row began before it.
@@ -584,43 +551,41 @@ class _Advance:
 
     def _history(self, row: int, first: int) -> FloatArray:
         """The frames `(n_conditioning, n_atoms, 3)` before frame `first` of a row."""
-        n = self.last.shape[1]
-        return np.concatenate([self.last[row], self.chunk.frames_nm[row, :first]])[-n:]
+        n = self.state.last_frames.shape[1]
+        return np.concatenate([self.state.last_frames[row], self.chunk.frames_nm[row, :first]])[-n:]
 
     def _check(self, rows: npt.NDArray[np.int64]) -> None:
-        with timed(self.plan.seconds, "check"):
-            frames, before = self.chunk.frames_nm[rows], self.last[rows, -1]
-            flags = self.plan.checks.check(frames, before, from_start=self.step == 0)
-            if self.plan.spread is not None:
-                flags |= np.uint16(validity.UNSURE) * self.plan.spread.unsure(frames)
+        with timed(self.state.seconds, "check"):
+            frames, before = self.chunk.frames_nm[rows], self.state.last_frames[rows, -1]
+            flags = self.checks.check(frames, before, from_start=self.state.steps == 0)
+            if self.potential is not None:
+                flags |= np.uint16(validity.UNSURE) * self.potential.unsure(frames)
             self.chunk.flags[rows] = flags
-        if self.plan.energy is not None:
-            with timed(self.plan.seconds, "energy limit"):
-                _ = self.plan.energy.limit
-            with timed(self.plan.seconds, "energy"):
+        if self.potential is not None and self.config.energy_every:
+            with timed(self.state.seconds, "energy"):
                 for row in rows.tolist():
-                    self._check_energies(row, self.plan.energy)
+                    self._check_energies(row, self.potential)
 
-    def _check_energies(self, row: int, check: EnergyCheck) -> None:
-        """Flag frames whose turn it is and whose energy is none that the reference has."""
-        steps = self.step + 1 + np.arange(self.chunk.flags.shape[1])
+    def _check_energies(self, row: int, potential: PotentialChecks) -> None:
+        """Flag frames whose turn it is and whose energy is far from the reference's."""
+        steps = self.state.steps + 1 + np.arange(self.chunk.flags.shape[1])
         energies = self.chunk.energies_kj_mol[row]
-        for k in np.flatnonzero((steps % self.plan.energy_every == 0) & ~caught(self.chunk.flags[row])).tolist():
+        for k in np.flatnonzero((steps % self.config.energy_every == 0) & ~caught(self.chunk.flags[row])).tolist():
             if np.isnan(energies[k]):
-                energies[k] = check.value(self.chunk.frames_nm[row, k])
-            if check.fails(energies[k]):
+                energies[k] = potential.difference(self.chunk.frames_nm[row, k])
+            if potential.is_wrong(energies[k]):
                 self.chunk.flags[row, k] |= np.uint16(validity.ENERGY)
 
     def _caught_rows(self) -> list[int]:
         rows: list[int] = np.flatnonzero(caught(self.chunk.flags).any(axis=1)).tolist()
-        for row, tally in enumerate(self.tallies):
+        for row, tally in enumerate(self.state.tallies):
             if row not in rows:
                 tally.md_in_a_row = 0
         return rows
 
     def _is_wrong(self, row: int) -> bool:
         """Whether no frame of this caught row passes, and no earlier chunk of it has got through without help."""
-        tally = self.tallies[row]
+        tally = self.state.tallies[row]
         return self._none_passes(row) and tally.chunks == tally.chunks_caught - 1
 
     def _none_passes(self, row: int) -> bool:
@@ -630,7 +595,7 @@ class _Advance:
         return ", ".join(validity.flag_names(int(np.bitwise_or.reduce(self.chunk.flags[row]))))
 
     def _seed(self, row: int, attempt: int) -> int:
-        return noise_seed(self.plan.seed, row, self.number, attempt)
+        return noise_seed(self.config.seed, row, self.state.chunks, attempt)
 
     def _seeds(self, rows: Sequence[int] | range, attempt: int) -> list[int]:
         return [self._seed(row, attempt) for row in rows]

@@ -19,8 +19,8 @@ class RolloutConfig:
     one that its model knows. `precision` 'bf16' is autocast of the network (coordinates and integration stay fp32),
     'auto' is bf16 where the processor multiplies it faster.
 
-    `guard`: see `surrogate.sampling.chunks`. `energy_every`: k, the energy of every k-th model frame is
-    checked, after stiff bonds are relaxed; 0 checks none. `anneal_ps`: before its first frame each replica of a learned
+    `guard`: see `surrogate.sampling.chunks`. `energy_every`: k, the energy of a learned potential is compared with the
+    reference's at every k-th frame; 0 compares none. `anneal_ps`: before its first frame each replica of a learned
     potential moves for so long, from 600 K down to its temperature, so that torsions that turn seldom start all over.
     `select` and `atoms` say which atoms are written; all are computed. Raises InputError.
     """
@@ -37,8 +37,11 @@ class RolloutConfig:
         "flag",
         choices=GUARDS,
     )
-    energy_every: int = option("Interval of energy checks with OpenMM, in frames; 0 for none.", 0, within=(0, None))
-    md_between_ps: float = option("Length of MD with OpenMM after each chunk.", 0.0, within=(0.0, None))
+    energy_every: int = option(
+        "Interval of checks of the energy against the reference's, in frames (learned potentials); 0 for none.",
+        0,
+        within=(0, None),
+    )
     select: str | None = option("Atoms to save, as an MDTraj selection: 'backbone'.", None)
     atoms: str = option("Save all atoms or heavy atoms only.", "all", choices=("all", "heavy"))
     force: bool = option("Roll out scenes outside the training domain; frames are flagged.", False)
@@ -85,4 +88,4 @@ class RolloutConfig:
     @property
     def needs_openmm(self) -> bool:
         """Whether frames are relaxed or simulated by OpenMM."""
-        return self.guard in ("repair", "fallback") or self.energy_every > 0 or self.md_between_ps > 0
+        return self.guard in ("repair", "fallback") or self.energy_every > 0

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections import Counter
-from collections.abc import Callable, Mapping
-from contextlib import suppress
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any
@@ -21,7 +19,7 @@ from surrogate.models.peptides.layout import PeptideConfig, chain_features, stan
 from surrogate.models.peptides.model import PeptideSlide
 from surrogate.models.potential import Potential
 from surrogate.models.weights import TrainingDomain, Weights, load_weights, read_header
-from systems.chemistry.graph import bonded_graph, match_atoms, rotatable_torsions
+from systems.chemistry.graph import match_atoms
 from systems.chemistry.validity import INVALID, NOT_FINITE, Geometry, check_frames, flag_names, geometry_from_scene
 from systems.errors import InputError, OutOfDomainError
 from systems.scene import Scene
@@ -33,9 +31,8 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Deviation:
-    """One way in which a scene leaves the training domain: `what` (elements, size, charge, bond types, torsion
-    environments, connectivity, stereo, start or temperature, of an unseen peptide also residues or ends), the `reason`
-    in words, and whether the model can be run nevertheless (`forcible`)."""
+    """One way in which a scene leaves the training domain: `what` (molecule, start or temperature, of an unseen peptide
+    also residues, size or ends), the `reason` in words, and whether the model can be run nevertheless (`forcible`)."""
 
     what: str
     reason: str
@@ -58,28 +55,6 @@ def member_of(scene: Scene, domain: TrainingDomain) -> TrainingDomain | None:
             continue
         return replace(member, further=(), transferable=False)
     return None
-
-
-def bond_types(scene: Scene) -> set[str]:
-    """Return the kinds of bonds by elements and order: {'C-H', 'C=O', 'C:N', ...}; ~ where no order is given."""
-    symbol = {0.0: "~", 1.0: "-", 1.5: ":", 2.0: "=", 3.0: "#"}
-    kinds = set()
-    for (i, j), order in zip(scene.bonds.tolist(), scene.bond_orders.tolist(), strict=True):
-        a, b = sorted((scene.elements[i], scene.elements[j]))
-        kinds.add(f"{a}{symbol.get(order, '~')}{b}")
-    return kinds
-
-
-def torsion_environments(scene: Scene) -> set[str]:
-    """Return the surroundings of each rotatable bond, the two atoms with their other neighbours: 'C(C,H,N)-C(N,O)' is
-    psi of alanine."""
-    near = scene.neighbours()
-
-    def end(atom: int, other: int) -> str:
-        rest = Counter(scene.elements[k] for k in near[atom] if k != other)
-        return f"{scene.elements[atom]}({','.join(sorted(rest.elements()))})"
-
-    return {"-".join(sorted((end(b, c), end(c, b)))) for _, b, c, _ in rotatable_torsions(scene).tolist()}
 
 
 _CAPS = ("ACE", "NME", "NH2")
@@ -227,8 +202,8 @@ def find_deviations(
 def match_domain(
     scene: Scene, weights: Weights, *, temperature_k: float | None = None, force: bool = False
 ) -> DomainMatch:
-    """Return the order of a scene's atoms in the model, and what of the training domain it leaves under `force`:
-    another stereoisomer, a strained start and another temperature can be forced, other atoms or bonds cannot.
+    """Return the order of a scene's atoms in the model, and what of the training domain it leaves under `force`: a
+    strained start and another temperature can be forced, another molecule or stereoisomer cannot.
 
     Raises OutOfDomainError, which says how the scene differs, what the weights cover and what to run instead.
     """
@@ -300,53 +275,19 @@ def _compare(
         new = unseen_neighbours(own.scene, domain) if not any(not d.forcible for d in found) else []
         nearness = f"residues that it never saw side by side: {', '.join(new)}" if new else "each pair of residues seen"
     elif member is None:
-        found = [Deviation("connectivity", "another molecule than those trained on", forcible=False)]
+        found = [Deviation("molecule", "another one than those trained on", forcible=False)]
     else:
-        order, found = _compare_molecules(scene, own.scene)
-        if not any(not d.forcible for d in found):
-            found += _compare_start(scene, order, Geometry.from_dict(own.geometry))
+        try:
+            order = match_atoms(scene, own.scene)
+            found = _compare_start(scene, order, Geometry.from_dict(own.geometry))
+        except OutOfDomainError as error:
+            found = [Deviation("molecule", str(error).rstrip("."), forcible=False)]
     trained_k = domain.conditions.get("temperature_k")
     asked_k = trained_k if temperature_k is None else temperature_k
     if trained_k is not None and abs(asked_k - trained_k) > TEMPERATURE_TOLERANCE_K:
         reason = f"{asked_k:g} K, trained at {trained_k:g} K, and this model takes no temperature"
         found.append(Deviation("temperature", reason, forcible=True))
     return DomainMatch(order, own, tuple(found), member is not None, nearness)
-
-
-def _compare_molecules(scene: Scene, template: Scene) -> tuple[npt.NDArray[np.int64], list[Deviation]]:
-    """Return the order of atoms and what differs; the order means nothing where that cannot be forced."""
-    try:
-        return match_atoms(scene, template), []
-    except OutOfDomainError as error:
-        refusal = str(error).rstrip(".")
-    found: list[Deviation] = []
-
-    def compare(what: str, of: Callable[[Scene], set[str]]) -> None:
-        if new := sorted(of(scene) - of(template)):
-            listed = ", ".join(new[:6]) + (f" and {len(new) - 6} more" if len(new) > 6 else "")
-            found.append(Deviation(what, f"{listed} not seen in training", forcible=False))
-
-    compare("elements", lambda s: set(s.elements))
-    found += _compare_sizes(scene, template)
-    compare("bond types", bond_types)
-    compare("torsion environments", torsion_environments)
-    order = None
-    if not found and scene.interactions == template.interactions:
-        order = _order_without_stereo(scene, template)
-    if order is None:
-        return np.arange(0), found or [Deviation("connectivity", refusal, forcible=False)]
-    return order, [Deviation("stereo", refusal, forcible=True)]
-
-
-def _compare_sizes(scene: Scene, template: Scene) -> list[Deviation]:
-    found = []
-    if sorted(scene.elements) != sorted(template.elements):
-        ours, theirs = (f"{s.n_atoms} atoms, {s.formula}" for s in (scene, template))
-        found.append(Deviation("size", f"{ours}; trained on {theirs}", forcible=False))
-    charges = int(scene.formal_charges.sum()), int(template.formal_charges.sum())
-    if charges[0] != charges[1]:
-        found.append(Deviation("charge", f"{charges[0]:+d}; trained on {charges[1]:+d}", forcible=False))
-    return found
 
 
 def _compare_start(scene: Scene, order: npt.NDArray[np.int64], geometry: Geometry) -> list[Deviation]:
@@ -361,20 +302,6 @@ def _flags_of_start(positions_nm: npt.NDArray[np.float64], geometry: Geometry) -
     """Return the flags of a start, whose atoms may be somewhat nearer than those of frames: it is no frame of MD."""
     roomy = replace(geometry, clash_min_nm=_ROOM_OF_START * geometry.clash_min_nm)
     return int(check_frames(positions_nm, roomy)[0]) & INVALID
-
-
-def _order_without_stereo(scene: Scene, template: Scene) -> npt.NDArray[np.int64] | None:
-    """Return an order that keeps elements and bonds, and every handedness of the mirror image where that fits."""
-    mirrored = scene.with_positions(scene.positions_nm * np.array([1.0, 1.0, -1.0]))
-    with suppress(OutOfDomainError):
-        return match_atoms(mirrored, template)
-    from networkx.algorithms.isomorphism import GraphMatcher, categorical_node_match
-
-    matcher = GraphMatcher(
-        bonded_graph(template), bonded_graph(scene), node_match=categorical_node_match("element", None)
-    )
-    image = next(matcher.isomorphisms_iter(), None)
-    return None if image is None else np.array([image[k] for k in range(template.n_atoms)], dtype=np.int64)
 
 
 def choose_weights(

@@ -7,7 +7,7 @@ import io
 import time
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -17,9 +17,18 @@ import numpy.typing as npt
 import torch
 
 from surrogate.models.potential import Potential
-from surrogate.sampling.chunks import Chunk, ChunkSampler, Guard, Interventions, Tally, noise_seed, none_through
+from surrogate.sampling.chunks import (
+    Chunk,
+    ChunkSampler,
+    Guard,
+    Interventions,
+    Progress,
+    Tally,
+    noise_seed,
+    none_through,
+)
 from surrogate.sampling.config import RolloutConfig as RolloutConfig
-from surrogate.sampling.coupling import Coupling, EnergyCheck, MemberSpread, ReferenceDifference, RelaxedEnergy
+from surrogate.sampling.coupling import Coupling, PotentialChecks
 from surrogate.sampling.domain import DomainMatch, fit_weights, in_bath
 from systems.chemistry.validity import INVALID, Geometry, check_frames
 from systems.errors import InputError, SimulationError, first_line
@@ -29,7 +38,7 @@ from systems.interrupts import deferred_interrupt
 from systems.scene import Scene, part_of, select_atoms
 from systems.trajectory import checkpoint
 from systems.trajectory.base import TrajectoryWriter
-from systems.trajectory.codec import open_trajectory
+from systems.trajectory.codec import DIFFERENCE_COLUMN, open_trajectory
 from systems.units import format_time_ps, whole_steps
 
 if TYPE_CHECKING:
@@ -54,7 +63,6 @@ class Plan:
     save_every_ps: float
     stride: int
     n_frames: int
-    n_between: int
     settings: dict[str, Any]
 
     @property
@@ -73,16 +81,14 @@ def resolve_plan(
     save_every_ps = lag_ps if config.save_every_ps is None else config.save_every_ps
     stride = whole_steps(save_every_ps, lag_ps, "save interval in the weights' frame spacing")
     n_frames = whole_steps(config.time_ps, save_every_ps, "rollout length in save intervals")
-    n_between = 0
-    if config.md_between_ps:
-        n_between = whole_steps(config.md_between_ps, lag_ps, "MD between chunks in the weights' frame spacing")
     kept = np.arange(scene.n_atoms) if config.atoms == "all" else scene.heavy_idx
     if config.select is not None:
         kept = np.intersect1d(kept, select_atoms(scene, config.select))
     if not len(kept):
         raise InputError(f"the selection leaves no atom of {scene.name} to write.")
-    if config.anneal_ps and not isinstance(weights.model, Potential):
-        raise InputError("`anneal_ps` is for learned potentials; these weights learned frames. Leave it out.")
+    for name in ("anneal_ps", "energy_every"):
+        if getattr(config, name) and not isinstance(weights.model, Potential):
+            raise InputError(f"`{name}` is for learned potentials; these weights learned frames. Leave it out.")
     centre = scene.positions_nm.mean(axis=0)
     settings = {
         **asdict(config),
@@ -94,34 +100,10 @@ def resolve_plan(
     }
     del settings["time_ps"]  # a rollout may be resumed to become longer
     shift_nm = centre if np.abs(centre).max() <= _FAR_NM else np.zeros(3)
-    return Plan(scene, weights, config, match, kept, shift_nm, save_every_ps, stride, n_frames, n_between, settings)
+    return Plan(scene, weights, config, match, kept, shift_nm, save_every_ps, stride, n_frames, settings)
 
 
 # Checkpoint of a rollout: written beside its first file after each flush, read by `resume`.
-
-Float32Array = npt.NDArray[np.float32]
-
-
-@dataclass
-class Progress:
-    """Where a rollout stands between two chunks.
-
-    `last_frames (replicas, n_conditioning, n_atoms, 3)` nm, in the model's atom order and the user's pose, relative to
-    where the scene's centre was; `velocities (replicas, n_atoms, 3)` nm/ps of a model that carries them. `steps`: model
-    frames done, kept or not. `batch`: replicas computed at once, if memory has run out before. `drawn`: chunks drawn of
-    all replicas, further draws included, which took `evaluations` of the network together.
-    """
-
-    last_frames: Float32Array
-    velocities: Float32Array | None = None
-    chunks: int = 0
-    steps: int = 0
-    wall_s: float = 0.0
-    batch: int | None = None
-    drawn: int = 0
-    evaluations: float = 0.0
-    seconds: dict[str, float] = field(default_factory=dict)
-    tallies: list[Tally] = field(default_factory=list)
 
 
 def packed_progress(progress: Progress) -> tuple[dict[str, Any], bytes]:
@@ -157,97 +139,172 @@ def progress_of(path: Path, state: checkpoint.Checkpoint, settings: dict[str, An
 # Record of a rollout: settings, provenance and summary in its files, and the lines shown while it runs.
 
 # Options that stand in a part of the record.
-_OF_INTERVENTIONS, _OF_SELECTION = ("guard", "energy_every", "md_between_ps"), ("atoms", "select")
+_OF_INTERVENTIONS, _OF_SELECTION = ("guard", "energy_every"), ("atoms", "select")
 
 
-def new_record(plan: Plan, sampler: ChunkSampler, checks: Guard, *, replica: int) -> dict[str, Any]:
-    """Return the record that a replica's file begins with; how long the run is, its frames say."""
-    options, weights = asdict(plan.config), plan.weights
-    apart = ("time_ps", *_OF_INTERVENTIONS, *_OF_SELECTION)
-    record = {
-        "kind": "rollout",
-        "model": weights.model.arch,
-        "weights": weights.path.name,
-        "weights_hash": weights.hash,
-        "program": {"torch": torch.__version__},
-        "started": datetime.now(UTC).isoformat(timespec="seconds"),
-        "completed": False,
-        "replica": replica,
-        **{name: value for name, value in options.items() if name not in apart},
-        "save_every_ps": plan.save_every_ps,
-        "lag_ps": weights.domain.lag_ps,
-        "precision": sampler.precision.name,
-        "precision_reason": sampler.precision.reason,
-        "solver": sampler.solver,
-        "chunk_frames": sampler.n_new,
-        **weights.domain.conditions,
-        "interventions": _interventions(plan, Tally(), {}, checks),
-    }
-    if not plan.match.seen:
-        record["unseen_molecule"] = True
-    if plan.match.deviations:
-        record["out_of_domain"] = [deviation.to_dict() for deviation in plan.match.deviations]
-    if len(plan.kept_atoms) < plan.scene.n_atoms:
-        record["selection"] = {**{name: options[name] for name in _OF_SELECTION}, "of_atoms": plan.scene.n_atoms}
-    if plan.shift_nm.any() != plan.scene.positions_nm.mean(axis=0).any():
-        record["moved_nm"] = (-plan.scene.positions_nm.mean(axis=0)).tolist()
-    return record
+# Frames of one replica, ready to be written, and what goes with them, by name.
+Block = dict[str, npt.NDArray[Any]]
 
 
-def _interventions(plan: Plan, tally: Tally, seconds: dict[str, float], checks: Guard) -> dict[str, Any]:
-    return {
-        **{name: getattr(plan.config, name) for name in _OF_INTERVENTIONS},
-        **tally.to_record(),
-        "seconds": {key: round(value, 3) for key, value in seconds.items()},
-        "unchecked": list(checks.unchecked),
-    }
+class _Rollout:
+    """A rollout under way: what it works with, where it stands, its files and the frames that wait to be written."""
 
+    def __init__(self, plan: Plan, sampler: ChunkSampler, state: Progress, state_path: Path, header: dict[str, Any],
+                 outs: Sequence[Path]) -> None:  # fmt: skip
+        self.plan, self.sampler, self.state, self.outs = plan, sampler, state, outs
+        self.checks = Guard(plan.weights.domain)
+        self._state_path, self._header = state_path, header
+        self._writers: list[TrajectoryWriter] = []
+        self._waiting: list[list[Block]] = [[] for _ in outs]
+        # What an interrupted run did before counts as no speed.
+        self._first_step, self._began = state.steps, time.monotonic()
 
-def close_summary(plan: Plan, state: Progress, checks: Guard, sampler: ChunkSampler,
-                   writers: Sequence[TrajectoryWriter], *, completed: bool) -> None:  # fmt: skip
-    """Enter what was done and what it cost, by now or in all."""
-    for writer, tally in zip(writers, state.tallies, strict=True):
-        summary = _interventions(plan, tally, state.seconds, checks)
-        cost = _cost(plan, state, tally, sampler, len(writers))
-        writer.update_record({"interventions": summary, "cost": cost, **({"completed": True} if completed else {})})
+    def open(self, stack: ExitStack, *, resumed: bool) -> None:
+        """Open the files of all replicas, to be closed with the stack."""
+        plan = self.plan
+        part = plan.scene if len(plan.kept_atoms) == plan.scene.n_atoms else part_of(plan.scene, plan.kept_atoms)
+        for k, path in enumerate(self.outs):
+            writer = checkpoint.writer_at(path, part, self._record(k), self._header, k, resumed=resumed)
+            self._writers.append(stack.enter_context(writer))
 
+    def save(self) -> None:
+        """Write the checkpoint."""
+        self._header["progress"], arrays = packed_progress(self.state)
+        checkpoint.write_checkpoint(self._state_path, self._header, arrays)
 
-def _cost(plan: Plan, state: Progress, tally: Tally, sampler: ChunkSampler, n_replicas: int) -> dict[str, Any]:
-    """A replica's share of the batch: wall seconds and network evaluations divided by the replicas."""
-    wall_s = max(state.wall_s, 1e-9) / n_replicas
-    n_frames = min(state.steps // plan.stride, plan.n_frames)
-    return {
-        "wall_s": wall_s,
-        "batch_wall_s": state.wall_s,
-        "network_evaluations": round((state.chunks + tally.draws) * sampler.evaluations_per_chunk),
-        "ns_per_day": n_frames * plan.save_every_ps * 1e-3 / wall_s * 86400.0,
-        "guard_share": sum(v for k, v in state.seconds.items() if k != "draw") / max(state.wall_s, 1e-9),
-        "batch": sampler.batch or n_replicas,
-    }
+    def put_by(self, chunk: Chunk) -> None:
+        """Put by the frames of a chunk that are kept, in the scene's atom order and place."""
+        plan, state = self.plan, self.state
+        steps = state.steps + 1 + np.arange(chunk.frames_nm.shape[1])
+        keep = np.flatnonzero((steps % plan.stride == 0) & (steps <= plan.n_steps))
+        atoms = np.argsort(plan.match.order)[plan.kept_atoms]
+        shift = plan.shift_nm.astype(np.float32)
+        for row, waiting in enumerate(self._waiting):
+            waiting.append(
+                {
+                    "frames": chunk.frames_nm[row, keep][:, atoms].astype(np.float32) + shift,
+                    "times": (steps[keep] * plan.weights.domain.lag_ps).astype(np.float64),
+                    "flags": chunk.flags[row, keep],
+                    "chunk_idx": np.full(len(keep), state.chunks, dtype=np.int32),
+                    "intervention": chunk.marks[row, keep],
+                    DIFFERENCE_COLUMN: chunk.energies_kj_mol[row, keep],
+                }
+            )
 
+    def move_on(self, chunk: Chunk) -> None:
+        """Go on from the end of a chunk."""
+        state, sampler = self.state, self.sampler
+        history = np.concatenate([state.last_frames, chunk.frames_nm], axis=1)
+        state.last_frames = history[:, -state.last_frames.shape[1] :].copy()
+        if chunk.velocities_nm_ps is not None:
+            state.velocities = chunk.velocities_nm_ps.astype(np.float32)
+        state.steps += chunk.frames_nm.shape[1]
+        state.chunks += 1
+        state.batch, state.drawn, state.evaluations = sampler.batch, sampler.drawn, sampler.evaluations
 
-def described_speed(plan: Plan, state: Progress, steps: int, elapsed_s: float) -> str:
-    """Return '24200 ns/day, 290 frames/s, 3 helped', of all replicas together, by the `steps` that this process made
-    of each; chunks that were helped."""
-    per_s = steps * len(state.tallies) / max(elapsed_s, 1e-9)
-    helped = sum(tally.chunks_caught for tally in state.tallies)
-    word = "caught" if plan.config.guard in ("off", "flag") else "helped"
-    ns_per_day = per_s * plan.weights.domain.lag_ps * 86.4
-    return f"{ns_per_day:.3g} ns/day, {per_s / plan.stride:.3g} frames/s, {helped} {word}"
+    def flush(self) -> None:
+        """Write the frames that wait, and the checkpoint that goes with them."""
+        scalars = ["intervention", *([DIFFERENCE_COLUMN] if self.plan.config.energy_every else [])]
+        for writer, waiting in zip(self._writers, self._waiting, strict=True):
+            if waiting:
+                joined = {name: np.concatenate([block[name] for block in waiting]) for name in waiting[0]}
+                columns = {name: joined[name] for name in scalars}
+                writer.append(joined["frames"], joined["times"], flags=joined["flags"], chunk_idx=joined["chunk_idx"],
+                              scalars=columns)  # fmt: skip
+                waiting.clear()
+        self._header["files"] = [{"n_frames": w.n_frames, "digest": w.digest()} for w in self._writers]
+        # Frames of the last chunk may be left out: a longer rollout could not go on from its end.
+        if self.state.steps < self.plan.n_steps:
+            self.save()
 
+    def summarise(self, *, completed: bool) -> None:
+        """Enter what was done and what it cost, by now or in all; a replica's cost is its share of the batch."""
+        state, n_replicas = self.state, len(self.outs)
+        wall_s = max(state.wall_s, 1e-9) / n_replicas
+        n_frames = min(state.steps // self.plan.stride, self.plan.n_frames)
+        for writer, tally in zip(self._writers, state.tallies, strict=True):
+            cost = {
+                "wall_s": wall_s,
+                "batch_wall_s": state.wall_s,
+                "network_evaluations": round((state.chunks + tally.draws) * self.sampler.evaluations_per_chunk),
+                "ns_per_day": n_frames * self.plan.save_every_ps * 1e-3 / wall_s * 86400.0,
+                "guard_share": sum(v for k, v in state.seconds.items() if k != "draw") / max(state.wall_s, 1e-9),
+                "batch": self.sampler.batch or n_replicas,
+            }
+            summary = self._interventions(tally, state.seconds)
+            writer.update_record({"interventions": summary, "cost": cost, **({"completed": True} if completed else {})})
 
-def why_stopped(plan: Plan, state: Progress, chunk: Chunk, outs: Sequence[Path]) -> str:
-    """Return why a rollout cannot go on, where, and what to do."""
-    assert chunk.failure is not None
-    row, reason = chunk.failure
-    at = f"after {format_time_ps(state.steps * plan.weights.domain.lag_ps)}" if state.steps else "in its first chunk"
-    if plan.config.guard in ("off", "flag"):
-        advice = f"the frames are marked in {outs[row]}. Try `precision='fp32'`, `guard='repair'` or other weights."
-        if plan.config.guard == "flag":
-            advice += " With `guard='off'` nothing stops it."
-    else:
-        advice = f"the frames before are in {outs[row]}. Use other weights, or `surromd reference` for this molecule."
-    return f"replica {row}, {at}: {reason}; {advice}"
+    def close(self) -> None:
+        """Close the files of a rollout that is complete."""
+        self.summarise(completed=True)
+        for writer in self._writers:
+            writer.close()
+
+    def speed(self) -> str:
+        """Return '24200 ns/day, 290 frames/s, 3 helped', of all replicas together, as this process made them; chunks
+        that were helped."""
+        state, plan = self.state, self.plan
+        steps = (state.steps - self._first_step) * len(state.tallies)
+        per_s = steps / max(time.monotonic() - self._began, 1e-9)
+        helped = sum(tally.chunks_caught for tally in state.tallies)
+        word = "caught" if plan.config.guard in ("off", "flag") else "helped"
+        ns_per_day = per_s * plan.weights.domain.lag_ps * 86.4
+        return f"{ns_per_day:.3g} ns/day, {per_s / plan.stride:.3g} frames/s, {helped} {word}"
+
+    def why_stopped(self, row: int, reason: str) -> str:
+        """Return why a rollout cannot go on, where, and what to do."""
+        plan, out = self.plan, self.outs[row]
+        done_ps = self.state.steps * plan.weights.domain.lag_ps
+        at = f"after {format_time_ps(done_ps)}" if done_ps else "in its first chunk"
+        if plan.config.guard in ("off", "flag"):
+            advice = f"the frames are marked in {out}. Try `precision='fp32'`, `guard='repair'` or other weights."
+            if plan.config.guard == "flag":
+                advice += " With `guard='off'` nothing stops it."
+        else:
+            advice = f"the frames before are in {out}. Use other weights, or `surromd reference` for this molecule."
+        return f"replica {row}, {at}: {reason}; {advice}"
+
+    def _record(self, replica: int) -> dict[str, Any]:
+        """Return the record that a replica's file begins with; how long the run is, its frames say."""
+        plan, sampler = self.plan, self.sampler
+        options, weights = asdict(plan.config), plan.weights
+        apart = ("time_ps", *_OF_INTERVENTIONS, *_OF_SELECTION)
+        record = {
+            "kind": "rollout",
+            "model": weights.model.arch,
+            "weights": weights.path.name,
+            "weights_hash": weights.hash,
+            "program": {"torch": torch.__version__},
+            "started": datetime.now(UTC).isoformat(timespec="seconds"),
+            "completed": False,
+            "replica": replica,
+            **{name: value for name, value in options.items() if name not in apart},
+            "save_every_ps": plan.save_every_ps,
+            "lag_ps": weights.domain.lag_ps,
+            "precision": sampler.precision.name,
+            "precision_reason": sampler.precision.reason,
+            "solver": sampler.solver,
+            "chunk_frames": sampler.n_new,
+            **weights.domain.conditions,
+            "interventions": self._interventions(Tally(), {}),
+        }
+        if not plan.match.seen:
+            record["unseen_molecule"] = True
+        if plan.match.deviations:
+            record["out_of_domain"] = [deviation.to_dict() for deviation in plan.match.deviations]
+        if len(plan.kept_atoms) < plan.scene.n_atoms:
+            record["selection"] = {**{name: options[name] for name in _OF_SELECTION}, "of_atoms": plan.scene.n_atoms}
+        if plan.shift_nm.any() != plan.scene.positions_nm.mean(axis=0).any():
+            record["moved_nm"] = (-plan.scene.positions_nm.mean(axis=0)).tolist()
+        return record
+
+    def _interventions(self, tally: Tally, seconds: dict[str, float]) -> dict[str, Any]:
+        return {
+            **{name: getattr(self.plan.config, name) for name in _OF_INTERVENTIONS},
+            **tally.to_record(),
+            "seconds": {key: round(value, 3) for key, value in seconds.items()},
+            "unchecked": list(self.checks.unchecked),
+        }
 
 
 # Stages of annealing, of which the first are hot: as hot as the states that potentials learn from.
@@ -299,7 +356,6 @@ def rollout(
         weights, solver_steps=config.solver_steps, solver=config.solver, precision=precision, compile=config.compile
     )
     plan = resolve_plan(scene, weights, match, config, sampler, n_replicas=len(outs))
-    checks = Guard(weights.domain)
     check_disk(outs[0], plan.n_frames * len(outs), len(plan.kept_atoms))
 
     with ExitStack() as stack:
@@ -324,75 +380,44 @@ def rollout(
         if config.needs_openmm:
             coupling = Coupling(weights)
             stack.callback(coupling.close)
-        learned = isinstance(weights.model, Potential)
-        energy: EnergyCheck | None = None
-        if config.energy_every and coupling is not None:
-            energy = ReferenceDifference(coupling, weights) if learned else RelaxedEnergy(coupling)
-        engine = Interventions(sampler, checks, config.guard, config.seed, state.seconds, coupling, config.energy_every,
-                               plan.n_between, energy, MemberSpread(weights) if learned else None)  # fmt: skip
-
-        def save() -> None:
-            header["progress"], arrays = packed_progress(state)
-            checkpoint.write_checkpoint(state_path, header, arrays)
-
+        potential = PotentialChecks(weights, coupling) if isinstance(weights.model, Potential) else None
+        run = _Rollout(plan, sampler, state, state_path, header, outs)
+        engine = Interventions(sampler, run.checks, config, state, coupling, potential)
         if not state.steps:
             # Before there are files, so that a rollout killed at any later moment can be gone on with.
-            save()
-        part = scene if len(plan.kept_atoms) == scene.n_atoms else part_of(scene, plan.kept_atoms)
-        writers: list[TrajectoryWriter] = []
-        for k, path in enumerate(outs):
-            record = new_record(plan, sampler, checks, replica=k)
-            opened = checkpoint.writer_at(path, part, record, header, k, resumed=kept is not None)
-            writers.append(stack.enter_context(opened))
-        buffers: list[list[Block]] = [[] for _ in outs]
+            run.save()
+        run.open(stack, resumed=kept is not None)
         started = time.monotonic() - state.wall_s
         flushed_at, flushed_s = time.monotonic(), 0.0
-        # What an interrupted run did before counts as no speed.
-        first_step, began = state.steps, time.monotonic()
-
-        def flush() -> None:
-            nonlocal flushed_at, flushed_s
-            since = time.monotonic()
-            for writer, buffer in zip(writers, buffers, strict=True):
-                _flush(writer, buffer, energy)
-            header["files"] = [{"n_frames": writer.n_frames, "digest": writer.digest()} for writer in writers]
-            # Frames of the last chunk may be left out: a longer rollout could not go on from its end.
-            if state.steps < plan.n_steps:
-                save()
-            flushed_at = time.monotonic()
-            flushed_s = flushed_at - since
-
         while state.steps < plan.n_steps:
-            chunk = engine.advance(
-                state.last_frames, state.velocities, state.tallies, chunk=state.chunks, step=state.steps
-            )
+            chunk = engine.advance()
             state.wall_s = time.monotonic() - started
             if chunk.failure is None and config.guard == "flag":
                 at_end = state.steps + chunk.frames_nm.shape[1] >= plan.n_steps
                 chunk.failure = none_through(state.tallies, sampler.n_new, at_end=at_end)
             if chunk.failure is not None:
                 if config.guard in ("off", "flag"):
-                    _buffer(plan, state, chunk, buffers)
-                flush()
-                close_summary(plan, state, checks, sampler, writers, completed=False)
+                    run.put_by(chunk)
+                run.flush()
+                run.summarise(completed=False)
                 state_path.unlink(missing_ok=True)
-                raise SimulationError(why_stopped(plan, state, chunk, outs))
-            _buffer(plan, state, chunk, buffers)
-            _move_on(state, chunk, sampler)
+                raise SimulationError(run.why_stopped(*chunk.failure))
+            run.put_by(chunk)
+            run.move_on(chunk)
             complete, stopping = state.steps >= plan.n_steps, asked_to_stop()
             pause_s = max(flush_every_s, checkpoint.FLUSH_SHARE * flushed_s if flush_every_s else 0.0)
             if complete or stopping or time.monotonic() - flushed_at > pause_s:
-                flush()
+                since = time.monotonic()
+                run.flush()
+                flushed_at = time.monotonic()
+                flushed_s = flushed_at - since
             if progress is not None:
-                speed = described_speed(plan, state, state.steps - first_step, time.monotonic() - began)
-                progress(min(state.steps // plan.stride, plan.n_frames), plan.n_frames, speed)
+                progress(min(state.steps // plan.stride, plan.n_frames), plan.n_frames, run.speed())
             if stopping and not complete:
-                close_summary(plan, state, checks, sampler, writers, completed=False)
+                run.summarise(completed=False)
                 raise KeyboardInterrupt
         state.wall_s = time.monotonic() - started
-        close_summary(plan, state, checks, sampler, writers, completed=True)
-        for writer in writers:
-            writer.close()
+        run.close()
         state_path.unlink(missing_ok=True)
     return list(outs)
 
@@ -431,53 +456,6 @@ def _annealed(plan: Plan, start: npt.NDArray[np.float32], asked_to_stop: Callabl
     lost = check_frames(frames[:, -1], Geometry.from_dict(plan.weights.domain.geometry)) & INVALID != 0
     frames[lost] = start[lost]
     return frames
-
-
-def _move_on(state: Progress, chunk: Chunk, sampler: ChunkSampler) -> None:
-    n_conditioning = state.last_frames.shape[1]
-    history = np.concatenate([state.last_frames, chunk.frames_nm], axis=1)
-    state.last_frames = history[:, -n_conditioning:].copy()
-    if chunk.velocities_nm_ps is not None:
-        state.velocities = chunk.velocities_nm_ps.astype(np.float32)
-    state.steps += chunk.frames_nm.shape[1]
-    state.chunks += 1
-    state.batch, state.drawn, state.evaluations = sampler.batch, sampler.drawn, sampler.evaluations
-
-
-# Frames of one replica, ready to be written, and what goes with them, by name.
-Block = dict[str, npt.NDArray[Any]]
-
-
-def _buffer(plan: Plan, state: Progress, chunk: Chunk, buffers: list[list[Block]]) -> None:
-    """Put by the frames of a chunk that are kept, in the scene's atom order and place."""
-    steps = state.steps + 1 + np.arange(chunk.frames_nm.shape[1])
-    keep = np.flatnonzero((steps % plan.stride == 0) & (steps <= plan.n_steps))
-    atoms = np.argsort(plan.match.order)[plan.kept_atoms]
-    shift = plan.shift_nm.astype(np.float32)
-    for row, buffer in enumerate(buffers):
-        buffer.append(
-            {
-                "frames": chunk.frames_nm[row, keep][:, atoms].astype(np.float32) + shift,
-                "times": (steps[keep] * plan.weights.domain.lag_ps).astype(np.float64),
-                "flags": chunk.flags[row, keep],
-                "chunk_idx": np.full(len(keep), state.chunks, dtype=np.int32),
-                "marks": chunk.marks[row, keep],
-                "energies": chunk.energies_kj_mol[row, keep],
-            }
-        )
-
-
-def _flush(writer: TrajectoryWriter, buffer: list[Block], check: EnergyCheck | None) -> None:
-    if not buffer:
-        return
-    joined = {name: np.concatenate([block[name] for block in buffer]) for name in buffer[0]}
-    scalars = {"intervention": joined["marks"]}
-    if check is not None:
-        scalars[check.column] = joined["energies"]
-    writer.append(
-        joined["frames"], joined["times"], flags=joined["flags"], chunk_idx=joined["chunk_idx"], scalars=scalars
-    )
-    buffer.clear()
 
 
 def _already_complete(outs: Sequence[Path], plan: Plan) -> list[Path]:

@@ -1,13 +1,12 @@
-"""A surrogate behind the face of `openmm.app.Simulation`: topology, reporters, step, context, checkpoints."""
+"""A surrogate behind the face of `openmm.app.Simulation`: topology, reporters, step, context; and a learned potential
+as other programs take it."""
 
 from __future__ import annotations
 
-import io
-import json
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, BinaryIO, NoReturn
+from typing import Any, NoReturn
 
 import numpy as np
 import numpy.typing as npt
@@ -20,18 +19,13 @@ from surrogate.models.weights import Weights, load_weights
 from surrogate.sampling.chunks import ChunkSampler, noise_seed
 from surrogate.sampling.config import RolloutConfig
 from surrogate.sampling.domain import fit_weights, match_domain
-from systems.errors import InputError, SimulationError, first_line
-from systems.files.outside import UNREADABLE, arrays_in
-from systems.files.schema import parsed
-from systems.files.whole_file import create_whole
+from systems.errors import InputError, SimulationError
 from systems.library.named_scenes import prepare
 from systems.options import from_field, options_as_keywords
 from systems.scene import Scene
 
 # positions (n_atoms, 3) nm -> potential energy in kJ/mol
 EnergyFn = Callable[[npt.NDArray[np.float64]], float]
-
-# The `openmm.State` of a surrogate: positions, time and energy; velocities and forces are refused by name.
 
 
 def _lacks(what: str) -> Any:
@@ -45,23 +39,18 @@ def _lacks(what: str) -> Any:
 
 @dataclass(frozen=True, eq=False)
 class SurrogateState:
-    """A snapshot: positions `(n_atoms, 3)` nm, time, step; `include` names what was asked for, as `openmm.State`.
-
-    Every getter raises SimulationError for what was not asked for or what a surrogate does not have.
-    """
+    """A snapshot as `openmm.State`: positions `(n_atoms, 3)` nm, time and step. Getters of what a surrogate does not
+    have raise SimulationError."""
 
     positions_nm: npt.NDArray[np.float32]
     time_ps: float
     step: int
-    include: frozenset[str]
     energy_fn: EnergyFn | None = None
 
     def getPositions(self, asNumpy: bool = False) -> Any:
         """Return positions with their unit: `Vec3`s, or an array `(n_atoms, 3)` with `asNumpy`."""
         from openmm import Vec3, unit
 
-        if "positions" not in self.include:
-            raise SimulationError("this state was taken without positions; call getState(positions=True).")
         positions = self.positions_nm.astype(np.float64)
         if asNumpy:
             return positions * unit.nanometer
@@ -80,8 +69,6 @@ class SurrogateState:
         """Return what the simulation's `energy_fn` says of the positions, with its unit."""
         from openmm import unit
 
-        if "energy" not in self.include:
-            raise SimulationError("this state was taken without energy; call getState(energy=True).")
         if self.energy_fn is None:
             raise SimulationError("a surrogate has no potential energy; give the simulation an energy_fn.")
         return float(self.energy_fn(self.positions_nm.astype(np.float64))) * unit.kilojoules_per_mole
@@ -171,7 +158,8 @@ class Simulation:
 
         if isinstance(scene, str | Path):
             scene = prepare(str(scene))
-        weights = _loaded(weights)
+        if isinstance(weights, str | Path):
+            weights = load_weights(weights_path(weights))
         weights, match = fit_weights(scene, weights, force=options.force, lag_ps=options.lag_ps)
         self.scene, self.weights, self.deviations = scene, weights, match.deviations
         self.energy_fn = energy_fn
@@ -213,60 +201,16 @@ class Simulation:
         """
         end = self.currentStep + int(steps)
         while self.currentStep < end:
-            asked = [_described(reporter.describeNextReport(self)) for reporter in self.reporters]
-            due = [wanted["steps"] for wanted in asked if wanted["steps"] > 0]
-            ahead = min([end - self.currentStep, *due])
+            asked = [reporter.describeNextReport(self) for reporter in self.reporters]
+            # A dictionary, or, of MDTraj's and older reporters, a tuple.
+            due = [wanted["steps"] if isinstance(wanted, dict) else wanted[0] for wanted in asked]
+            ahead = min([end - self.currentStep, *(steps for steps in due if steps > 0)])
             self._advance(ahead)
-            for reporter, wanted in zip(self.reporters, asked, strict=True):
-                if wanted["steps"] == ahead:
-                    reporter.report(self, self._state(frozenset(wanted["include"])))
-
-    def saveCheckpoint(self, file: str | Path | BinaryIO) -> None:
-        """Write where the simulation stands to a path or a binary file, all random numbers to come included."""
-        header = {"settings": self._settings(), "current_step": self.currentStep, "chunks": self._chunks,
-                  "frames": self._frames}  # fmt: skip
-        arrays = {"last": self._last, "current": self._current, "pending": self._pending, "centre": self._centre}
-        if self._velocities is not None:
-            arrays["velocities"] = self._velocities
-        buffer = io.BytesIO()
-        np.savez(buffer, allow_pickle=False, header=np.array(json.dumps(header)), **arrays)
-        if isinstance(file, str | Path):
-            create_whole(Path(file), buffer.getvalue())
-        else:
-            file.write(buffer.getvalue())
-
-    def loadCheckpoint(self, file: str | Path | BinaryIO) -> None:
-        """Go back to where a checkpoint was saved; what follows is the same bit for bit.
-
-        Raises InputError when it is damaged, or of another scene, other weights or settings; nothing changes then.
-        """
-        name = str(file) if isinstance(file, str | Path) else "the checkpoint"
-        try:
-            arrays = arrays_in(file)
-            header = parsed(str(arrays.pop("header")))
-            settings, counts = header["settings"], [int(header[k]) for k in ("current_step", "chunks", "frames")]
-            last, current, pending, centre = (arrays[key] for key in ("last", "current", "pending", "centre"))
-        except UNREADABLE as error:
-            raise InputError(f"{name} cannot be read as a checkpoint ({first_line(error)}); take another.") from error
-        for key, value in self._settings().items():
-            if settings.get(key) != value:
-                raise InputError(f"{name} was saved with {key} = {settings.get(key)!r}, not {value!r}.")
-        self._last, self._current, self._pending, self._centre = last, current, pending, centre
-        self._velocities = arrays.get("velocities")
-        self.currentStep, self._chunks, self._frames = counts
+            for reporter, steps in zip(self.reporters, due, strict=True):
+                if steps == ahead:
+                    reporter.report(self, self.state())
 
     minimizeEnergy = _lacks("energy to minimise; prepare the scene, or minimise it with OpenMM")
-
-    def _settings(self) -> dict[str, Any]:
-        return {
-            "lag_ps": self.lag_ps,
-            "weights_hash": self.weights.hash,
-            "topology_hash": self.scene.topology_hash,
-            "seed": self._seed,
-            "solver": self._sampler.solver,
-            "solver_steps": self._sampler.solver_steps,
-            "precision": self._sampler.precision.name,
-        }
 
     def _begin(self, positions_nm: npt.ArrayLike) -> None:
         """Start from positions `(n_atoms, 3)` nm in the scene's order; what was drawn ahead is dropped."""
@@ -306,9 +250,9 @@ class Simulation:
         self._velocities = None if ends is None else ends[0].astype(np.float32)
         self._chunks += 1
 
-    def _state(self, include: frozenset[str]) -> SurrogateState:
-        time_ps = self._frames * self.lag_ps
-        return SurrogateState(self.positions_nm, time_ps, self.currentStep, include, self.energy_fn)
+    def state(self) -> SurrogateState:
+        """Return a snapshot of where the simulation stands."""
+        return SurrogateState(self.positions_nm, self._frames * self.lag_ps, self.currentStep, self.energy_fn)
 
 
 class SurrogateIntegrator:
@@ -335,18 +279,8 @@ class SurrogateContext:
         self._simulation = simulation
 
     def getState(self, **wanted: Any) -> SurrogateState:
-        """Return a snapshot with what is asked for: `positions=True`, `energy=True` (or OpenMM's older `getPositions`).
-
-        Raises InputError for an unknown property; what a surrogate lacks raises when the state is asked for it.
-        """
-        include = set()
-        for key, value in wanted.items():
-            name = key.removeprefix("get").lower()
-            if name not in _PROPERTIES:
-                raise InputError(f"getState() knows no {key!r}; known: {', '.join(sorted(_PROPERTIES))}.")
-            if value:
-                include.add(name)
-        return self._simulation._state(frozenset(include))
+        """Return a snapshot, whatever is asked for; what a surrogate lacks raises when the state is asked for it."""
+        return self._simulation.state()
 
     def getIntegrator(self) -> SurrogateIntegrator:
         return self._simulation.integrator
@@ -369,25 +303,6 @@ class SurrogateContext:
         self._simulation._begin(np.array([tuple(row) for row in positions], dtype=np.float64))
 
 
-# `groups`, `enforcePeriodicBox` and the like change nothing where there are no forces and no box.
-_PROPERTIES = {
-    "positions", "velocities", "forces", "energy", "parameters", "parameterderivatives", "integratorparameters",
-    "enforceperiodicbox", "groups",
-}  # fmt: skip
-
-
-def _loaded(weights: str | Path | Weights) -> Weights:
-    return load_weights(weights_path(weights)) if isinstance(weights, str | Path) else weights
-
-
-def _described(report: Any) -> dict[str, Any]:
-    """Return what a reporter's `describeNextReport` says as a dictionary; OpenMM's older tuples too."""
-    if isinstance(report, dict):
-        return report
-    names = ("positions", "velocities", "forces", "energy")
-    return {"steps": report[0], "include": [name for name, asked in zip(names, report[1:5], strict=True) if asked]}
-
-
 # A learned potential as other programs take it: a function of positions, an OpenMM force, an ASE calculator.
 
 FloatArray = npt.NDArray[np.floating[Any]]
@@ -404,7 +319,7 @@ class LearnedForces:
     """
 
     def __init__(self, scene: Scene, weights: str | Path | Weights) -> None:
-        loaded = _loaded(weights)
+        loaded = load_weights(weights_path(weights)) if isinstance(weights, str | Path) else weights
         if not isinstance(loaded.model, Potential):
             raise InputError(
                 f"{loaded.path.name} makes frames, not forces ({loaded.model.arch}); train a potential with "

@@ -8,10 +8,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from surrogate.models.architecture import weights_path
+from surrogate.verbs.inputs import check_outputs, find_trajectories
 from surrogate.verbs.options import CompareOptions, DemoOptions, PathLike, Trajectories
-from surrogate.verbs.outputs import check_outputs, find_trajectories
-from surrogate.verbs.reference import reference as run_reference
-from surrogate.verbs.rollout import rollout
+from surrogate.verbs.simulate import reference as run_reference
+from surrogate.verbs.simulate import rollout
 from systems.errors import InputError
 from systems.options import options_as_keywords
 

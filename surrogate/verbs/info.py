@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import math
 from pathlib import Path
 from typing import Any
 
 from surrogate.models.architecture import shipped_weights
-from surrogate.verbs.campaign import describe_campaign
 from surrogate.verbs.options import PathLike
+from surrogate.verbs.simulate import describe_campaign
 from systems.errors import InputError, OutOfDomainError, first_line
 from systems.files.outside import UNREADABLE, content
 from systems.files.schema import parsed
@@ -37,15 +36,15 @@ def info(path: PathLike, scene: str | None = None) -> dict[str, Any]:
 
 def _run(folder: Path) -> dict[str, Any] | None:
     """Return what the folder of a run, or of runs of many molecules, says of itself; None for another folder."""
-    path = next((file for file in (folder / "run.json", folder / "results.json") if file.is_file()), None)
-    if path is None:
+    from surrogate.verbs.run.run_record import RUN_NAME, RunResult
+
+    if (folder / RUN_NAME).is_file():
+        return RunResult.of(folder)
+    path = folder / "results.json"
+    if not path.is_file():
         return None
     try:
         found = parsed(content(path))
-        if path.name == "run.json":
-            outcome, stages = found["outcome"], len(found["stages"])
-            summary = outcome["headline"] if outcome else f"not done; {stages} stages have ended"
-            return {"file": str(folder), "type": "run", "summary": summary, **found}
         lines = {line["name"]: f"failed: {line['failed']}" if line["failed"] else line["headline"] for line in found}
     except UNREADABLE as error:
         raise InputError(f"{path} cannot be read as the record of a run ({first_line(error)}).") from None
@@ -129,35 +128,19 @@ def rollout_lines(record: dict[str, Any]) -> list[str]:
     return lines if reason is None else [*lines, f"network in {record.get('precision')}: {reason}"]
 
 
-def _percent(share: float) -> str:
-    """Return such as '0.12 %', '7.4 %', '62 %', '100 %'; the last of nothing less than all."""
-    percent = 100.0 * share
-    if 99.0 <= percent < 100.0:
-        return f"{math.floor(10.0 * percent) / 10.0:g} %"
-    return f"{percent:.2g} %" if percent < 99.0 else f"{percent:.0f} %"
-
-
 def intervention_lines(record: dict[str, Any]) -> list[str]:
-    """Return what a rollout's guards caught and did, and what that cost; nothing of other files."""
+    """Return what a rollout's guards caught and did; nothing of other files."""
     summary = record.get("interventions")
     if not isinstance(summary, dict):
         return []
-    helped, chunks = summary["chunks_caught"], summary["chunks"]
-    line = f"guard {summary['guard']}: {helped} of {chunks} chunks caught"
-    if helped:
-        reasons = sorted(summary.get("reasons", {}).items(), key=lambda r: -r[1])
-        line += f" ({_percent(helped / max(chunks, 1))}): " + ", ".join(f"{name} ({n} frames)" for name, n in reasons)
+    line = f"guard {summary['guard']}: {summary['chunks_caught']} of {summary['chunks']} chunks caught"
+    if reasons := sorted(summary.get("reasons", {}).items(), key=lambda r: -r[1]):
+        line += ": " + ", ".join(f"{name} ({n} frames)" for name, n in reasons)
     if not summary["frames"]:
         return [line]
-    seconds = dict(summary.get("seconds", {}))
-    drawn_s = seconds.pop("draw", 0.0) or math.inf
-    return [
-        line,
-        "frames that are not the surrogate's first draw: "
-        + ", ".join(f"{n} {name}" for name, n in summary["frames"].items()),
-        "cost beside drawing chunks: " + ", ".join(f"{name} {_percent(v / drawn_s)}" for name, v in seconds.items()),
-        *(f"bias: {why}" for why in summary["bias"]),
-    ]
+    helped = ", ".join(f"{n} {name}" for name, n in summary["frames"].items())
+    bias = (f"bias: {why}" for why in summary["bias"])
+    return [line, f"frames that are not the surrogate's first draw: {helped}", *bias]
 
 
 def _windows(path: Path) -> dict[str, Any]:

@@ -41,6 +41,11 @@ class Replicated:
 
 
 @dataclass(frozen=True, kw_only=True)
+class Joining(Replicated):
+    join: bool = option("Also write all replicas into one file, NAME.h5.", False)
+
+
+@dataclass(frozen=True, kw_only=True)
 class Quiet:
     quiet: bool = option("No progress bar and no summary.", False, words=("quiet", "q"))
 
@@ -95,7 +100,7 @@ class PlanOptions(MDSettings, Replicated, Preparation):
 
 
 @dataclass(frozen=True, kw_only=True)
-class ReferenceOptions(MDSettings, Replicated, Preparation, Seeded, Resuming, Overwriting, Quiet):
+class ReferenceOptions(MDSettings, Joining, Preparation, Seeded, Resuming, Overwriting, Quiet):
     """Options of `reference`."""
 
     time_ps: float = from_field(MDConfig, "time_ps")
@@ -106,7 +111,7 @@ class ReferenceOptions(MDSettings, Replicated, Preparation, Seeded, Resuming, Ov
 
 
 @dataclass(frozen=True, kw_only=True)
-class RolloutOptions(RolloutConfig, Replicated, Preparation, Resuming, Overwriting, Quiet):
+class RolloutOptions(RolloutConfig, Joining, Preparation, Resuming, Overwriting, Quiet):
     """Options of `rollout`."""
 
 
@@ -197,6 +202,42 @@ class RunOptions(MDSettings, Preparation, OnDask, Seeded, Resuming, Overwriting,
     format: str = option("Trajectory format.", "h5", choices=("h5", "dcd", "xtc"))
     cores: int | None = option("Maximum number of CPU cores.", None, within=(1, None), unset="all")
     dry_run: bool = option("Print the timings and the decision without running.", False)
+
+
+@dataclass(frozen=True, kw_only=True)
+class CostErrorConfig:
+    """What is the same for all settings. Rolled are `time_ps` in all replicas together, in `rounds` parts, after
+    `discarded_ps` of each replica that count in neither cost nor error; MD runs `slice_ps` before each part."""
+
+    time_ps: float = option("Rollout time per setting, all replicas together.", 20_000.0, within=(1.0, None))
+    discarded_ps: float = option("Time left out at the start of each replica.", 100.0, within=(0.0, None), words=None)
+    rounds: int = option("Number of blocks, alternating with OpenMM.", 4, within=(1, None))
+    slice_ps: float = option("Length of MD before each block.", 40.0, within=(0.01, None), words=None)
+    lag_ps: float | None = option(
+        "Interval between compared frames.", None, within=(1e-6, None), unset="as in the references"
+    )
+    threads: int = option("Number of threads of both.", 1, within=(1, None), words=None)
+    seed: int = option("Random seed.", 0, within=(0, None))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Sweep:
+    """The settings of a benchmark: all combinations of what is given."""
+
+    solvers: Sequence[str] | None = option(
+        "Solver to try; repeatable.", None, words=("solver",), unset="all of a fixed number of steps"
+    )
+    steps: Sequence[int] = option("Solver steps to try; repeatable.", (2, 3, 4, 6, 10, 20), within=(1, None))
+    precisions: Sequence[str] = option(
+        "Precision to try; repeatable.", ("auto",), choices=("auto", "fp32", "bf16"), words=("precision",)
+    )
+    batches: Sequence[int] = option("Number of replicas to try; repeatable.", (32,), within=(1, None), words=("batch",))
+    compiled: bool = option("Also time the compiled network.", False, words=("compile",))
+
+
+@dataclass(frozen=True, kw_only=True)
+class CostErrorOptions(CostErrorConfig, Sweep, Quiet):
+    """Options of `bench cost-error`: what is the same for all settings, and which settings."""
 
 
 # By the verb's name in Python.

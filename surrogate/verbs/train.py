@@ -1,31 +1,49 @@
 """The verbs `windows` and `train`: training data in one file; an architecture and settings that suit the references,
-or a potential of one molecule at an expensive level of theory, then the training and its verdict."""
+or a potential of one molecule at an expensive level of theory, then the training and its verdict: how far it came, what
+its weights do in a short guarded rollout, and what would help."""
 
 from __future__ import annotations
 
+import json
+import statistics
+import tempfile
 import time
+from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from surrogate.models.architecture import architecture, names, weights_path
 from surrogate.progress import progress_bar
+from surrogate.verbs.inputs import check_outputs, find_trajectories, prepare_scene
 from surrogate.verbs.options import PathLike, TrainOptions, Trajectories, WindowsOptions, tell
-from surrogate.verbs.outputs import check_outputs, find_trajectories
-from surrogate.verbs.scenes import prepare_scene
-from systems.errors import InputError
-from systems.files.whole_file import OutputLock
+from systems.errors import InputError, SurromdError
+from systems.files.whole_file import OutputLock, create_whole
 from systems.options import Preparation, options_as_keywords
 from systems.scene import Scene
+from systems.units import format_time_ps
 
 if TYPE_CHECKING:
     from surrogate.data import References
-    from surrogate.models.architecture import Choice, Trainer, TrainingRequest
+    from surrogate.models.architecture import Trainer, TrainingRequest
+    from surrogate.models.potential import Potential
+    from surrogate.models.weights import Weights
 
 
 POTENTIAL = "painet-potential"
+# Frames that pass the guards, in per cent: from the first on the weights can be rolled as they are, from the second on
+# with a guard that helps.
+USABLE, WITH_HELP = 99.0, 90.0
+_REPLICAS, _CHUNKS, _MOLECULES = 4, 6, 6
+_TIMED_FORCES = 9
+# A validation error that falls by this share over the second half of the last stage has not settled; one this many
+# times the error in training is of frames that the network knows by heart.
+_STILL_FALLS, _BY_HEART = 0.03, 1.5
+_FEW_FRAMES = 20_000
 
 
 @options_as_keywords(WindowsOptions)
@@ -47,20 +65,6 @@ def windows(references: Trajectories, out: PathLike, options: WindowsOptions) ->
     frames.refuse_leaks()
     frames.save(out)
     return out
-
-
-@dataclass(frozen=True)
-class _Plan:
-    """What will be trained and how. `why`: one line for the architecture and one for each setting that was chosen."""
-
-    trainer: Trainer
-    references: References
-    request: TrainingRequest
-    choices: tuple[Choice, ...]
-    why: str
-
-    def lines(self) -> list[str]:
-        return [f"arch = {self.request.arch}: {self.why}", *(choice.line() for choice in self.choices)]
 
 
 @options_as_keywords(TrainOptions)
@@ -85,7 +89,7 @@ def train(references: Trajectories, out: PathLike, options: TrainOptions) -> Pat
 
     Beside `out`, a CSV holds the training curves and, until done, files the state that `resume` goes on from; at the
     end the curves are drawn (.svg), and a short rollout that is checked frame by frame says whether the weights are
-    usable and, where they are not, what would help (NAME.verdict.json, surrogate.verbs.train_verdict).
+    usable and, where they are not, what would help (NAME.verdict.json).
     Raises InputError, TrajectoryError, SimulationError (training diverged), StorageError.
     """
     out = Path(out)
@@ -107,10 +111,12 @@ def train(references: Trajectories, out: PathLike, options: TrainOptions) -> Pat
         return written
     from surrogate.training.devices import choose_device
 
-    plan = _plan(references, options.validation, replace(asked, device=choose_device(options.device)))
-    prepared = plan.trainer.prepare(plan.references, plan.request)
+    trainer, found, asked, lines = _plan(
+        references, options.validation, replace(asked, device=choose_device(options.device))
+    )
+    prepared = trainer.prepare(found, asked)
     if not options.quiet:
-        for line in plan.lines():
+        for line in lines:
             tell(out.name, line)
     with (
         OutputLock(out),
@@ -118,7 +124,7 @@ def train(references: Trajectories, out: PathLike, options: TrainOptions) -> Pat
         _said_when_stopped(out),
     ):
         written = prepared.start(_shown(bar))
-    _conclude(written, fitted=plan.trainer.fitted, quiet=options.quiet)
+    _conclude(written, fitted=trainer.fitted, quiet=options.quiet)
     return written
 
 
@@ -141,12 +147,12 @@ def explain_training(references: Trajectories, options: TrainOptions) -> str:
     """
     from surrogate.models.architecture import toml_text
 
-    plan = _plan(references, options.validation, _asked(options, Path("explained.safetensors")), explained=True)
-    head = "".join(f"# {line}\n" for line in plan.lines())
-    tables = plan.trainer.settings(plan.request).tables()
-    if plan.request.start_from is not None:
+    asked = _asked(options, Path("explained.safetensors"))
+    trainer, _, asked, lines = _plan(references, options.validation, asked, explained=True)
+    tables = trainer.settings(asked).tables()
+    if asked.start_from is not None:
         tables.pop("model", None)
-    return head + toml_text({"arch": plan.request.arch, **tables})
+    return "".join(f"# {line}\n" for line in lines) + toml_text({"arch": asked.arch, **tables})
 
 
 def _asked(options: TrainOptions, out: Path) -> TrainingRequest:
@@ -175,9 +181,11 @@ def _asked(options: TrainOptions, out: Path) -> TrainingRequest:
     )
 
 
-def _plan(references: Trajectories, validation: Trajectories | None, asked: TrainingRequest, *,
-          explained: bool = False) -> _Plan:  # fmt: skip
-    """Find the references and choose what is not asked for."""
+def _plan(
+    references: Trajectories, validation: Trajectories | None, asked: TrainingRequest, *, explained: bool = False
+) -> tuple[Trainer, References, TrainingRequest, list[str]]:
+    """Find the references and choose what is not asked for; return what trains, on what, how, and the reasons: a line
+    for the architecture and one for each setting that was chosen."""
     from surrogate.data import References
 
     if asked.arch and asked.start_from is not None:
@@ -190,23 +198,17 @@ def _plan(references: Trajectories, validation: Trajectories | None, asked: Trai
     found = References(tuple(paths), tuple(held), spool=asked.out.parent)
     why = "asked for"
     if not asked.arch:
-        name, why = _suited(found)
+        fits = [(*fit, name) for name in names() if (fit := architecture(name).suits(found.survey)) is not None]
+        if not fits:
+            raise InputError("no installed architecture suits these references by itself; name one with `arch`.")
+        _, why, name = max(fits)
         asked = replace(asked, arch=name)
     trainer: Trainer = architecture(asked.arch).trainer()
     if not explained:
         trainer.check(asked)
     choices = trainer.choose(found, asked)
-    return _Plan(trainer, found, asked.with_choices(choices), choices, why)
-
-
-def _suited(references: References) -> tuple[str, str]:
-    """Return the name of the architecture that suits the references best, and why."""
-    survey = references.survey
-    fits = [(*fit, name) for name in names() if (fit := architecture(name).suits(survey)) is not None]
-    if not fits:
-        raise InputError("no installed architecture suits these references by itself; name one with `arch`.")
-    _, why, name = max(fits)
-    return name, why
+    lines = [f"arch = {asked.arch}: {why}", *(choice.line() for choice in choices)]
+    return trainer, found, asked.with_choices(choices), lines
 
 
 @contextmanager
@@ -215,15 +217,10 @@ def _said_when_stopped(out: Path) -> Iterator[None]:
     try:
         yield
     except KeyboardInterrupt:
-        states = sorted(out.parent.glob(f"{out.stem}.*.train.safetensors"))
-        samples = out.with_name(f"{out.stem}.samples.safetensors")
-        if states:
-            kept = f"the state is in {states[-1]}"
-        elif samples.exists():
-            kept = f"the samples are in {samples}"
-        else:
+        kept = sorted(out.parent.glob(f"{out.stem}.*.safetensors"))
+        if not kept:
             raise KeyboardInterrupt("no training state had been saved yet") from None
-        raise KeyboardInterrupt(f"{kept}; the same again with `resume=True` goes on") from None
+        raise KeyboardInterrupt(f"the state is in {kept[-1]}; the same again with `resume=True` goes on") from None
 
 
 def _conclude(written: Path, *, fitted: bool, quiet: bool) -> None:
@@ -235,13 +232,11 @@ def _conclude(written: Path, *, fitted: bool, quiet: bool) -> None:
         plot_curves(curves)
     if fitted:
         return
-    from surrogate.verbs.train_verdict import compare_training, write_verdict
-
     try:
         verdict = compare_training(written)
     except KeyboardInterrupt:
         raise KeyboardInterrupt(f"{written} is written; only the rollout that tries it was cut short") from None
-    write_verdict(written, verdict)
+    create_whole(written.with_suffix(".verdict.json"), json.dumps(asdict(verdict), indent=1) + "\n")
     if not quiet:
         for line in verdict.lines():
             tell(written.name, line)
@@ -256,7 +251,7 @@ def learn_molecule(
     """Learn the molecule that `given` names from `options.level` and return the weights.
 
     The budget is of wall time for all of it: the molecule's preparation, answers, steps, and the verdict that the
-    caller comes to (`train_verdict.compare_training`). Raises InputError for what means nothing here, PreparationError
+    caller comes to (`compare_training`). Raises InputError for what means nothing here, PreparationError
     for what the level of theory refuses.
     """
     began = time.monotonic()
@@ -284,7 +279,6 @@ def learn_molecule(
     from md_reference.run.labeller import Labeller
     from surrogate.models.painet.energy import PainetPotential
     from surrogate.models.painet.potential_trainer import PotentialTrainer
-    from surrogate.verbs.train_verdict import trial_s
 
     trainer: PotentialTrainer = architecture(POTENTIAL).trainer()
     config = trainer.settings(request).model  # what is wrong with it is known before anything is computed
@@ -298,3 +292,152 @@ def learn_molecule(
                 out.name, f"{reference.n_rearranged} states left out: they are another molecule, by bonds or handedness"
             )
         return out
+
+
+# ---- the verdict ---------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class TrainingVerdict:
+    """How a training went. `steps` and `validation` (named as in the curves) by stage; of the rollout the frames, how
+    many in per cent pass the guards, and what is wrong with the others, in frames; `stopped`: why it could not go on.
+
+    `word`: 'usable', 'usable with help' (`guard='repair'` or resample) or 'not usable'; `advice`: what would help.
+    """
+
+    steps: dict[str, int]
+    validation: dict[str, dict[str, float]]
+    rolled_ps: float
+    n_frames: int
+    percent_valid: float
+    reasons: dict[str, int]
+    stopped: str
+    word: str
+    advice: tuple[str, ...]
+
+    def lines(self) -> list[str]:
+        """Return it for people."""
+        done = ", ".join(f"{name} {steps} steps" for name, steps in self.steps.items())
+        last = [each for columns in self.validation.values() for each in columns.items()]
+        errors = ", ".join(f"{column.removeprefix('validation_')} {value:.3g}" for column, value in last)
+        wrong = "; the others: " * bool(self.reasons) + ", ".join(f"{name} ({n})" for name, n in self.reasons.items())
+        found = f"{self.percent_valid:.3g} % of {self.n_frames} frames pass the guards{wrong}"
+        lines = [
+            f"trained: {done}; validation error: {errors}",
+            f"rolled {format_time_ps(self.rolled_ps)} without help: {found}",
+        ]
+        if self.stopped:
+            lines.append(f"the rollout stopped: {self.stopped}")
+        if self.word == "usable":
+            return [*lines, "usable; whether populations and time scales are right, `surromd compare` with MD shows"]
+        help_ = "usable with `guard='repair'` or resample alone" if self.word != "not usable" else "not usable as it is"
+        return [*lines, f"{help_}; what would help: {'; '.join(self.advice)}"]
+
+
+def compare_training(path: Path) -> TrainingVerdict:
+    """Roll freshly trained weights from the structures they know, and say what they are good for. Draws each chunk
+    once, so that the share of frames that pass is the network's own. Raises WeightsError, InputError."""
+    from surrogate.models.weights import load_weights
+    from surrogate.training.loop import read_curves, series
+
+    weights = load_weights(path)
+    rolled_ps, n_frames, reasons, n_caught, stopped = _roll(weights)
+    curves = path.with_suffix(".csv")
+    stages = read_curves(curves) if curves.exists() else {}
+    validation: dict[str, dict[str, float]] = {}
+    for stage, rows in stages.items():
+        columns = [c for c in rows[-1] if c.startswith("validation_")]
+        validation[stage] = {c: values[-1] for c in columns if (values := series(rows, c)[1])}
+    valid = 100.0 * (1.0 - n_caught / max(n_frames, 1))
+    word = word_of(valid, stopped)
+    return TrainingVerdict(
+        steps={stage: int(rows[-1]["step"]) for stage, rows in stages.items()},
+        validation=validation,
+        rolled_ps=rolled_ps,
+        n_frames=n_frames,
+        percent_valid=valid,
+        reasons=dict(reasons.most_common()),
+        stopped=stopped,
+        word=word,
+        advice=() if word == "usable" else tuple(_advice(weights, stages)),
+    )
+
+
+def trial_s(model: Potential, scene: Scene) -> float:
+    """Return about how many seconds the rollout of `compare_training` takes with a potential of a scene, by timing its
+    forces."""
+    import torch
+
+    from surrogate.models.propagator import Molecule
+
+    molecule = Molecule.of(scene)
+    frames = torch.tensor(scene.positions_nm)[None].expand(_REPLICAS, -1, -1)
+    model.eval()
+    taken = []
+    for _ in range(1 + _TIMED_FORCES):
+        began = time.monotonic()
+        model.forces(frames, molecule)
+        taken.append(time.monotonic() - began)
+    # The first prepares the molecule.
+    return _CHUNKS * model.n_new * model.steps_per_frame * statistics.median(taken[1:])
+
+
+def word_of(percent_valid: float, stopped: str = "") -> str:
+    """Return a verdict on weights in a word: by how many frames of a rollout are valid, and whether it `stopped`."""
+    if stopped or percent_valid < WITH_HELP:
+        return "not usable"
+    return "usable" if percent_valid >= USABLE else "usable with help"
+
+
+def _roll(weights: Weights) -> tuple[float, int, Counter[str], int, str]:
+    """Roll up to six of the molecules trained on, four replicas of six chunks each; return the time in ps and the
+    frames of all, how many the guards caught and why, and what stopped the rollout."""
+    from surrogate.sampling.chunks import caught
+    from surrogate.sampling.runner import RolloutConfig, rollout
+    from systems.chemistry.validity import flag_names
+    from systems.trajectory.codec import open_trajectory
+
+    time_ps, n_frames, n_caught, reasons, stopped = 0.0, 0, 0, Counter[str](), ""
+    members, lag_ps = weights.domain.members, weights.domain.lag_ps
+    config = RolloutConfig(
+        time_ps=_CHUNKS * weights.model.n_new * lag_ps, lag_ps=lag_ps if weights.domain.jumps else None
+    )
+    for domain in members[:: -(-len(members) // _MOLECULES)]:
+        with tempfile.TemporaryDirectory(prefix="surromd-verdict-") as folder:
+            outs = [Path(folder) / f"r{k}.h5" for k in range(_REPLICAS)]
+            try:
+                rollout(domain.scene, weights, outs, config)
+            except SurromdError as error:  # also a structure that the checks of its own reference do not pass
+                stopped = stopped or str(error).split(";")[0]
+            for out in filter(Path.exists, outs):
+                with open_trajectory(out) as reader:
+                    flags = np.zeros(0, np.uint16) if reader.flags is None else np.asarray(reader.flags, np.uint16)
+                wrong = flags[caught(flags)]
+                n_frames, n_caught = n_frames + len(flags), n_caught + len(wrong)
+                time_ps += len(flags) * domain.lag_ps
+                reasons.update(name for bits in wrong.tolist() for name in flag_names(bits))
+    return time_ps, n_frames, reasons, n_caught, stopped
+
+
+def _advice(weights: Weights, stages: dict[str, list[dict[str, str]]]) -> list[str]:
+    """Return what would help, what is likeliest first."""
+    from surrogate.models.potential import Potential
+    from surrogate.training.loop import series
+
+    found: list[str] = []
+    # A potential learned from states, which need be no MD.
+    sources = [] if isinstance(weights.model, Potential) else weights.provenance.get("sources", ())
+    n_frames = sum(int(source.get("n_frames", 0)) for source in sources)
+    rows = list(stages.values())[-1] if stages else []
+    column = next((c for c in (rows[-1] if rows else {}) if c.startswith("validation_")), "")
+    values, trained = (
+        series(rows, column.replace("validation_", kind))[1] if column else [] for kind in ("validation_", "train_")
+    )
+    if len(values) < 4 or values[-1] < (1.0 - _STILL_FALLS) * values[len(values) // 2]:
+        found.append("more minutes (`budget_s`): the validation error had not settled")
+    if values and trained and values[-1] > _BY_HEART * trained[-1]:
+        times = values[-1] / trained[-1]
+        found.append(f"more reference MD: the validation error is {times:.2g} times that in training")
+    elif 0 < n_frames < _FEW_FRAMES:
+        found.append(f"more reference MD: {n_frames} frames are few")
+    return found or ["more minutes (`budget_s`) and more reference MD"]

@@ -7,12 +7,12 @@ from typing import Any
 
 import numpy as np
 import pytest
+from md_speed import plain_system
 
 from md_reference.forces.forcefield import build_system
 from md_reference.forces.spec import ForceFieldSpec
 from md_reference.run.config import Conditions
 from md_reference.run.engine import Engine
-from surrogate.bench.timing import plain_system
 from systems.errors import PreparationError, UnknownNameError
 from systems.library.named_scenes import prepare
 from systems.scene import FloatArray, Scene

@@ -15,7 +15,6 @@ import pytest
 from surrogate.models.weights import Weights, load_weights
 from surrogate.sampling.chunks import Tally
 from surrogate.sampling.runner import Progress, packed_progress, progress_of
-from surrogate.sampling.simulation import Simulation
 from systems.errors import SurromdError
 from systems.scene import Scene
 from systems.trajectory.checkpoint import new_header, read_checkpoint, write_checkpoint
@@ -141,17 +140,6 @@ def read_weights(path: Path) -> dict[str, Any]:
             "provenance": weights.provenance}  # fmt: skip
 
 
-def simulation_reader(scene: Scene, small_weights: Weights) -> Callable[[Path], Any]:
-    simulation = Simulation(scene, small_weights, seed=5, solver_steps=1, precision="fp32")
-
-    def read(path: Path) -> dict[str, Any]:
-        simulation.loadCheckpoint(path)
-        state = {key: value for key, value in vars(simulation).items() if isinstance(value, np.ndarray | int)}
-        return {key: value.tobytes() if isinstance(value, np.ndarray) else value for key, value in state.items()}
-
-    return read
-
-
 def prepare(kind: str, folder: Path, scene: Scene, small_weights: Weights) -> tuple[Path, Callable[[Path], Any]]:
     """Make the files of a kind in a folder; return the one to mutate and what reads them."""
     if kind in ("a.h5", "a.dcd"):
@@ -166,17 +154,11 @@ def prepare(kind: str, folder: Path, scene: Scene, small_weights: Weights) -> tu
     if kind == "reference checkpoint":
         write_checkpoint(folder / "b.h5.checkpoint", new_header(0, overwrite=False), b"state" * 300)
         return folder / "b.h5.checkpoint", read_checkpoint
-    if kind == "simulation checkpoint":
-        simulation = Simulation(scene, small_weights, seed=5, solver_steps=1, precision="fp32")
-        simulation.step(9)
-        simulation.saveCheckpoint(folder / "s.npz")
-        return folder / "s.npz", simulation_reader(scene, small_weights)
     (folder / "w.safetensors").write_bytes(small_weights.path.read_bytes())
     return folder / "w.safetensors", read_weights
 
 
-KINDS = ("a.h5", "a.dcd", "a.meta.h5", "a.pdb", "weights", "rollout checkpoint", "reference checkpoint",
-         "simulation checkpoint")  # fmt: skip
+KINDS = ("a.h5", "a.dcd", "a.meta.h5", "a.pdb", "weights", "rollout checkpoint", "reference checkpoint")  # fmt: skip
 
 
 def outcome(path: Path, read: Callable[[Path], Any], reference: Any) -> str:

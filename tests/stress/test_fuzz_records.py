@@ -27,8 +27,8 @@ from surrogate.data import TrainingFrames, collect_frames, load_frames
 from surrogate.models.weights import Weights, load_weights
 from surrogate.sampling.runner import RolloutConfig, rollout
 from surrogate.training.loop import tensor_checksum
-from surrogate.verbs.campaign import describe_campaign
 from surrogate.verbs.info import describe_file
+from surrogate.verbs.simulate import describe_campaign
 from systems.errors import InputError, SurromdError
 from systems.files.whole_file import sealed
 from systems.library.named_scenes import load

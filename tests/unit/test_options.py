@@ -14,7 +14,7 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
-from surrogate.cli.parameters import with_options
+from surrogate.cli.main import with_options
 from surrogate.cli.render import as_flags
 from systems.errors import InputError, UnitError, UnknownNameError
 from systems.options import (

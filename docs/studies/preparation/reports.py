@@ -13,7 +13,7 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 
-from surrogate.verbs.run.many_scenes import molecules_in
+from surrogate.verbs.run.run_scenes import molecules_in
 from systems.errors import SurromdError
 from systems.library.named_scenes import prepare
 from systems.trajectory.codec import open_trajectory

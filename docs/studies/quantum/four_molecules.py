@@ -25,11 +25,10 @@ import torch
 import surrogate as sm
 from md_reference.forces.quantum import Potential
 from md_reference.run.machine import machine_name
-from surrogate.bench.stress_page import HALF_ANGSTROM_RULE
 from surrogate.models.painet.potential_trainer import Samples, samples_path
 from surrogate.models.propagator import Molecule
 from surrogate.models.weights import load_weights
-from systems.chemistry.validity import check_frames, geometry_from_frames
+from systems.chemistry.validity import BOND_HALF_ANGSTROM, NOT_FINITE, check_frames, geometry_from_frames
 from systems.errors import SimulationError
 from systems.prepare.molecule import scene_from_smiles
 from systems.scene import FloatArray, Scene
@@ -102,7 +101,8 @@ class ReferenceForces:
 
     def compare(self, runs: list[FloatArray], save_ps: float) -> list[str]:
         """Return of replicas: how long they are stable, how many are lost, how far their h(r) is from each MD run's."""
-        kept = [until_lost(run, check_frames(run, self.geometry) & HALF_ANGSTROM_RULE != 0) for run in runs]
+        rule = NOT_FINITE | BOND_HALF_ANGSTROM
+        kept = [until_lost(run, check_frames(run, self.geometry) & rule != 0) for run in runs]
         stable_ps = np.array([len(run) for run in kept]) * save_ps
         lost = sum(len(k) < len(run) for k, run in zip(kept, runs, strict=True))
         words = f"{stable_ps.mean():.0f} of {len(runs[0]) * save_ps:.0f} ps, {lost} of {len(runs)} lost"

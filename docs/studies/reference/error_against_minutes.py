@@ -44,9 +44,8 @@ from surrogate.comparison.measure.structure import Baseline, evenly
 from surrogate.comparison.measure.torsions import find_wells
 from surrogate.comparison.read.ensemble import Ensemble, load_ensemble
 from surrogate.verbs.options import ReferenceOptions
-from surrogate.verbs.reference import resolve_run
-from surrogate.verbs.run.run_record import RUN_NAME
-from surrogate.verbs.run.run_result import RunResult
+from surrogate.verbs.run.run_record import RUN_NAME, RunResult
+from surrogate.verbs.simulate import resolve_run
 from systems.errors import SurromdError
 from systems.library.named_scenes import prepare
 from systems.trajectory.checkpoint import checkpoint_path

@@ -25,10 +25,10 @@ from typing import Any
 import numpy as np
 
 from md_reference.forces.forcefield import build_system, resolve
-from md_reference.forces.spec import ForceFieldSpec, WaterBox
+from md_reference.forces.spec import PROTEIN_FILES, ForceFieldSpec, WaterBox, cutoff_nm, water_file
 from md_reference.run.config import Conditions
 from md_reference.run.machine import available_cores, platform_for, platform_properties
-from surrogate.bench.timing import machine_facts, plain_context
+from surrogate.bench.timing import machine_facts
 from systems.errors import InputError, SimulationError, SurromdError, first_line, nearest
 from systems.files.whole_file import create_whole
 from systems.interrupts import end_with_parent
@@ -118,6 +118,49 @@ class Setup:
     platform: str
     threads: str
     timestep_ps: float
+
+
+def plain_context(scene: Scene, spec: ForceFieldSpec, *, threads: int | None) -> Any:
+    """Return an `openmm.Context` of what OpenMM's manual makes of the model: its files, its defaults, 300 K, 1/ps, 2
+    fs, the platform it picks by itself.
+
+    `threads`: of the CPU platform where that is picked; None leaves its default, all cores.
+    """
+    from openmm import LangevinMiddleIntegrator, Platform, app
+
+    topology, system = scene.to_openmm_topology(), plain_system(scene, spec)
+    simulation = app.Simulation(topology, system, LangevinMiddleIntegrator(300.0, 1.0, 0.002))
+    if threads is not None and simulation.context.getPlatform().getName() == "CPU":
+        chosen = Platform.getPlatform("CPU"), {"Threads": str(threads)}
+        simulation = app.Simulation(topology, system, LangevinMiddleIntegrator(300.0, 1.0, 0.002), *chosen)
+    return simulation.context
+
+
+def plain_system(scene: Scene, spec: ForceFieldSpec) -> Any:
+    """Return the `openmm.System` by OpenMM's own way: its XML files, or for GAFF2 its reader of the same prmtop.
+
+    Bonds to hydrogen are rigid, as a step of 2 fs needs; all else is default, the removal of the centre of mass's
+    motion included.
+    """
+    from openmm import app, unit
+
+    rigid = {"constraints": app.HBonds}
+    if spec.force_field == "gaff2":
+        from md_reference.forces.gaff import load_openmm, parameters
+
+        implicit = {"implicitSolvent": app.OBC2} if spec.solvent == "obc2" else {}
+        return load_openmm(parameters(scene)).createSystem(nonbondedMethod=app.NoCutoff, **rigid, **implicit)
+    files = [PROTEIN_FILES[spec.force_field]]
+    box: dict[str, Any] = {"nonbondedMethod": app.NoCutoff}
+    if spec.solvent == "obc2":
+        files.append("implicit/obc2.xml")
+    elif spec.is_explicit:
+        files.append(str(water_file(spec.force_field, spec.solvent)))
+        box = {"nonbondedMethod": app.PME, "nonbondedCutoff": cutoff_nm(spec.force_field)[0] * unit.nanometer}
+    topology = scene.to_openmm_topology()
+    if scene.cell_nm is not None:
+        topology.setPeriodicBoxVectors(scene.cell_nm * unit.nanometer)
+    return app.ForceField(*files).createSystem(topology, **rigid, **box)
 
 
 def plain(scene: Scene, spec: ForceFieldSpec, *, threads: int | None) -> Setup:

@@ -17,8 +17,7 @@ from typing import Any
 
 import surrogate as sm
 from md_reference.run.machine import machine_name
-from surrogate.verbs.run.run_record import RUN_NAME
-from surrogate.verbs.run.run_result import RunResult
+from surrogate.verbs.run.run_record import RUN_NAME, RunResult
 from systems.units import format_time_ps, format_wall, parse_time_ps
 
 REPLICAS = 16

@@ -16,8 +16,7 @@ from typing import Any
 
 import surrogate as sm
 from md_reference.run.machine import machine_name
-from surrogate.verbs.run.run_record import RUN_NAME
-from surrogate.verbs.run.run_result import RunResult
+from surrogate.verbs.run.run_record import RUN_NAME, RunResult
 from systems.errors import SurromdError
 from systems.prepare.peptide import build_peptide
 from systems.trajectory.companion_writer import pdb_text

@@ -19,15 +19,14 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
-from surrogate.bench.accuracy import samples_per_second
-from surrogate.bench.bench_options import CostErrorConfig, Setting
-from surrogate.bench.cost_error import refuse_trained_on
+from surrogate.bench.cost_error import refuse_trained_on, samples_per_second
 from surrogate.bench.timing import Roller, machine_facts, roll_in_turns
 from surrogate.comparison.measure.distributions import RAMACHANDRAN_BINS, distance, is_positive
 from surrogate.models.architecture import weights_path
 from surrogate.models.weights import load_weights
 from surrogate.sampling.chunks import ChunkSampler
 from surrogate.sampling.domain import fit_weights
+from surrogate.verbs.options import CostErrorConfig
 from systems.chemistry.validity import INVALID, Geometry, check_frames
 from systems.trajectory.codec import open_trajectory
 
@@ -111,11 +110,10 @@ def main() -> None:
     config = CostErrorConfig(time_ps=1e3 * args.ns)
     for name in args.settings:
         solver, steps = name.split(":")
-        setting = Setting(solver, int(steps), batch=args.batch, compile=args.compile)
         sampler = ChunkSampler(fitted, solver=solver, solver_steps=int(steps), compile=args.compile)
         roller = Roller(fitted, sampler, rows=args.batch, seed=0)
         roller.advance(sampler.n_new)  # settles, and compiles
-        parts, cost = roll_in_turns(fitted, roller, sampler, setting, config)
+        parts, cost = roll_in_turns(fitted, roller, sampler, config)
         frames = np.concatenate(parts, axis=1)
         row = told(list(torsions(fitted.domain.scene, frames)), args.lag, reference)
         flags = np.concatenate([check_frames(x, geometry) for x in frames])

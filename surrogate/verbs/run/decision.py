@@ -90,8 +90,9 @@ def decide(
     least_s = least_budget_s(rates)
     if budget_s < least_s:
         raise InputError(
-            f"{format_wall(max(budget_s, 0.0))} are left, too few to simulate and evaluate anything on this machine, "
-            f"as busy as it is: {format_wall(least_s)} it takes. Use a longer `budget_s`."
+            f"a budget of {format_wall(max(budget_s, whole_s, 0.0))} is too short: simulating and evaluating anything "
+            f"takes {format_wall(least_s)} on this machine, as busy as it is. Use "
+            f"`budget_s='{10 * math.ceil(least_s / 10.0)}s'` or more."
         )
     budget_s *= _AIM
     at_all_s, of_frame_s = _report_s(rates)
@@ -229,32 +230,29 @@ def errors_in_words(errors: dict[str, float]) -> str:
     return f"error to expect of a population: {said}"
 
 
-def table(rates: Rates, decision: Decision, budget_s: float) -> list[tuple[str, str]]:
-    """Return the decision and what it rests on, as lines of a name and a text."""
+def table(rates: Rates, decision: Decision, budget_s: float) -> dict[str, str]:
+    """Return the decision and what it rests on, in words by name."""
 
     def per_day(ps_per_s: float) -> str:
         return f"{format_time_ps(ps_per_s * 86_400, 3)} a day"
 
     busy = f", of which other work takes {1.0 - 1.0 / rates.stretch:.0%}" if rates.stretch > 1.1 else ""
     cores = "one core" if rates.cores == 1 else f"{rates.cores} cores"
-    lines = [
-        ("MD", rates.md.rsplit("; about", 1)[0]),
-        ("by OpenMM", f"{per_day(rates.openmm_ps_per_s)} on {cores}{busy}, a replica on each"),
-    ]
+    lines = {
+        "MD": rates.md.rsplit("; about", 1)[0],
+        "by OpenMM": f"{per_day(rates.openmm_ps_per_s)} on {cores}{busy}, a replica on each",
+    }
     if rates.at_once > 1:
-        lines.append(("by SIMD", f"{per_day(rates.md_ps_per_s)}, {rates.at_once} replicas on each core"))
+        lines["by SIMD"] = f"{per_day(rates.md_ps_per_s)}, {rates.at_once} replicas on each core"
     elif rates.without_simd:
-        lines.append(("by SIMD", rates.without_simd))
+        lines["by SIMD"] = rates.without_simd
     if (rolls := rates.rolls) is not None:
-        lines.append(("by rollout", f"{per_day(rolls.ps_per_s)}, {rolls.replicas} replicas of {rolls.weights}"))
-    lines.append(("way", PLANS[decision.way].words))
-    lines += [("because", reason) for reason in decision.why]
-    for stage in decision.stages:
-        is_md = stage.name in MD_STAGES
-        to_come_ps = md_ps(rates, decision, stage.name) if is_md else decision.expected_rollout_ps
-        to_come = (
-            f", about {format_time_ps(to_come_ps, 2)}" if to_come_ps and (is_md or stage.name == "rollout") else ""
-        )
-        lines.append((stage.name, format_wall(stage.seconds) + to_come))
-    lines.append(("in all", f"{format_wall(budget_s)}, frames every {format_time_ps(decision.save_every_ps)}"))
+        lines["by rollout"] = f"{per_day(rolls.ps_per_s)}, {rolls.replicas} replicas of {rolls.weights}"
+    lines |= {"way": PLANS[decision.way].words, "because": "; ".join(decision.why)}
+    for name, seconds in ((stage.name, stage.seconds) for stage in decision.stages):
+        lines[name] = format_wall(seconds)
+        to_come_ps = decision.expected_rollout_ps if name == "rollout" else md_ps(rates, decision, name)
+        if name in (*MD_STAGES, "rollout") and to_come_ps:
+            lines[name] += f", about {format_time_ps(to_come_ps, 2)}"
+    lines["in all"] = f"{format_wall(budget_s)}, frames every {format_time_ps(decision.save_every_ps)}"
     return lines

@@ -1,10 +1,13 @@
-"""A run of one scene: its folder, its stages one after the other within the budget, the report at the end."""
+"""A run of one scene: its folder, its clock, its stages one after the other within the budget, the report last."""
 
 from __future__ import annotations
 
+import contextvars
 import math
 import shutil
 import sys
+import threading
+import time
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import replace
@@ -12,9 +15,9 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
-from surrogate.progress import progress_bar
+from surrogate.progress import ProgressFn, progress_bar
+from surrogate.verbs.inputs import prepare_scene
 from surrogate.verbs.options import RunOptions, tell
-from surrogate.verbs.reference import resolve_run
 from surrogate.verbs.run.decision import (
     LEAST_MD_S,
     MD_STAGES,
@@ -25,21 +28,16 @@ from surrogate.verbs.run.decision import (
     decide,
     least_budget_s,
     seconds_of_first,
+    table,
 )
 from surrogate.verbs.run.rates import by_openmm, measure
-from surrogate.verbs.run.run_record import (
-    RUN_NAME,
-    RunRecord,
-    StageEntry,
-    read_run,
-    settings_of_run,
-    write_run,
-)
-from surrogate.verbs.run.stage_clock import Clock
+from surrogate.verbs.run.run_record import RUN_NAME, RunRecord, StageEntry, read_run, settings_of_run, write_run
 from surrogate.verbs.run.stages import STAGES, Site, md_options
-from surrogate.verbs.scenes import prepare_scene
+from surrogate.verbs.simulate import resolve_run
 from systems.errors import InputError, SimulationError, SurromdError
 from systems.files.whole_file import OutputLock
+from systems.interrupts import deferred_interrupt, stop_when
+from systems.units import format_wall
 
 if TYPE_CHECKING:
     from md_reference.run.config import MDConfig
@@ -47,124 +45,197 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 LOG_NAME = "log.txt"
+_TICK_S = 0.2
+_SAVE_EVERY_S = 2.0
 # Without these there is nothing to evaluate; a run that lost them to a fault of the surrogate goes on by MD.
 _OF_SURROGATE = ("train", "rollout")
-_GOES_ON = "the same again with `resume=True` goes on"
 
 
 def plan_scene(scene: str | Path | Scene, options: RunOptions) -> RunRecord:
     """Return what a run of a scene would be: rates, measured now, and the decision. Nothing is written."""
     molecule, config = _prepared(scene, options)
-    record = _new_record(scene, molecule, options)
-    return _decide(record, molecule, config, options, lambda: 0.0)
+    return _decide(_new_record(scene, molecule, options), molecule, config, options, lambda: 0.0)
 
 
-def run_scene(
-    scene: str | Path | Scene, folder: Path, options: RunOptions, tell_decision: Callable[[RunRecord], None]
-) -> RunRecord:
+def run_scene(scene: str | Path | Scene, folder: Path, options: RunOptions) -> RunRecord:
     """Run a scene into `folder`, or go on with the run there, and return its record, which is done.
 
-    `tell_decision` is called when it is known how the budget is spent. Raises InputError for a folder that is not
-    ours, KeyboardInterrupt with what is kept, and what preparing a scene or MD of it raises.
+    Raises InputError for a folder that is not ours, KeyboardInterrupt with what is kept, and what preparing a scene or
+    MD of it raises.
     """
-    before = _open_folder(folder, options)
+    before, named = _open_folder(folder, options), _named(scene)
     try:
-        with OutputLock(folder / RUN_NAME), progress_bar(f"run {_named(scene)}", quiet=options.quiet) as advance:
-            kept = _Kept(folder, before)
-            named, log = _named(scene), folder / LOG_NAME
-            clock = Clock(
-                options.budget_s,
-                before.spent_s if before else 0.0,
-                kept.beat,
-                advance,
-                lambda line: _say(log, named, line, quiet=options.quiet),
-            )
-            molecule, config = _before_stages(clock, "preparing", lambda: _prepared(scene, options))
+        with OutputLock(folder / RUN_NAME), progress_bar(f"run {named}", quiet=options.quiet) as advance:
+            run = _Run(folder, named, options, before, advance)
+            molecule, config = run.before_stages("preparing", lambda: _prepared(scene, options))
             if before is None:
                 record = _new_record(scene, molecule, options)
             else:
                 before.check_same(settings_of_run(options), molecule.topology_hash, folder)
                 record = _taken_up(before, options)
-            kept.keep(record, clock.spent_s)
+            run.keep(record)
             if record.decision is None:
                 new = record
-                record = _before_stages(
-                    clock, "measuring", lambda: _decide(new, molecule, config, options, lambda: clock.spent_s)
+                record = run.before_stages(
+                    "measuring", lambda: _decide(new, molecule, config, options, lambda: run.clock.spent_s)
                 )
-            tell_decision(record)
-            kept.keep(record, clock.spent_s)
-            return _Run(Site(folder, molecule, config, options), kept, clock).to_the_end()
+                run.keep(record)
+            if not options.quiet and record.rates is not None and record.decision is not None:
+                for name, text in table(record.rates, record.decision, options.budget_s).items():
+                    tell(molecule.name, f"{name}: {text}")
+            return run.to_the_end(Site(folder, molecule, config, options))
     except KeyboardInterrupt as stop:
         if not (folder / RUN_NAME).exists():
             raise
         said = f"{stop.args[0].split(';')[0]}; " if stop.args else ""
-        raise KeyboardInterrupt(f"{said}{folder} keeps what was done; {_GOES_ON}") from None
+        raise KeyboardInterrupt(
+            f"{said}{folder} keeps what was done; the same again with `resume=True` goes on"
+        ) from None
 
 
-class _Kept:
-    """The record of a run as it is on disk: every change is there before the next stage, and every few seconds what is
-    spent, in all and in the stage under way, so that a kill costs no more."""
+class Clock:
+    """Counts the wall time of a run, of earlier sittings too (`spent_s`). `save` gets every few seconds what is spent,
+    so that a run that is killed does not start its budget over; `advance` shows it, `warn` says once, and while it
+    happens, that the budget is overrun."""
 
-    def __init__(self, folder: Path, record: RunRecord | None) -> None:
-        self._folder, self.record = folder, record
-        self.stage = ""
+    def __init__(
+        self,
+        budget_s: float,
+        spent_s: float,
+        save: Callable[[float], None],
+        advance: ProgressFn | None = None,
+        warn: Callable[[str], None] = lambda line: None,
+    ) -> None:
+        self.budget_s = budget_s
+        self._before_s, self._began = spent_s, time.monotonic()
+        self._save, self._advance, self._warn = save, advance, warn
+        self._is_over = spent_s > budget_s
 
-    def keep(self, record: RunRecord, spent_s: float) -> None:
-        """Make `record` the run's, here and on disk."""
-        self.record = replace(record, spent_s=round(spent_s, 1))
-        write_run(self._folder, self.record)
+    @property
+    def spent_s(self) -> float:
+        return self._before_s + time.monotonic() - self._began
 
-    def beat(self, spent_s: float) -> None:
-        """Note what is spent by now."""
-        if self.record is None:
-            return
-        spent_in = dict(self.record.spent_in)
-        if self.stage:
-            more_s = spent_s - self.record.spent_s
-            spent_in[self.stage] = round(spent_in.get(self.stage, 0.0) + more_s, 1)
-        self.keep(replace(self.record, spent_in=spent_in), spent_s)
+    def work(self, said: str, may_take_s: float, stage: Callable[[], T]) -> T | None:
+        """Do a stage and return its result; None where it was asked to stop, as Ctrl-C asks, when its time was up.
+
+        A stage runs in a thread of its own, and must end with KeyboardInterrupt when it is asked to
+        (`deferred_interrupt`, `stop_if_asked`). Ctrl-C stops it likewise: KeyboardInterrupt with the stage's own words.
+        Raises what it raises.
+        """
+        until = time.monotonic() + may_take_s
+        results: list[T] = []
+        errors: list[BaseException] = []
+        with deferred_interrupt() as asked_to_stop:
+
+            def body() -> None:
+                try:
+                    with stop_when(lambda: asked_to_stop() or time.monotonic() > until):
+                        results.append(stage())
+                except BaseException as error:
+                    errors.append(error)
+
+            thread = threading.Thread(target=contextvars.copy_context().run, args=(body,), name=said, daemon=True)
+            thread.start()
+            saved = time.monotonic()
+            while thread.is_alive():
+                thread.join(_TICK_S)
+                self._show(said)
+                if time.monotonic() - saved > _SAVE_EVERY_S:
+                    saved = time.monotonic()
+                    self._save(self.spent_s)
+            self._save(self.spent_s)
+            if errors and isinstance(errors[0], KeyboardInterrupt):
+                if asked_to_stop():
+                    raise KeyboardInterrupt(*errors[0].args) from None
+                return None
+            if errors:
+                raise errors[0]
+            if asked_to_stop():
+                raise KeyboardInterrupt
+        return results[0]
+
+    def _show(self, said: str) -> None:
+        spent_s = self.spent_s
+        if spent_s > self.budget_s + _SAVE_EVERY_S and not self._is_over:
+            self._is_over = True
+            self._warn(
+                f"{said}: over the budget of {format_wall(self.budget_s)}, as busy as the machine is; it goes on"
+            )
+        if self._advance is not None:
+            note = f"{said}, {format_wall(round(spent_s))} of {format_wall(self.budget_s)}"
+            spent_s = min(spent_s, self.budget_s)
+            self._advance(round(10 * spent_s), round(10 * self.budget_s), note)
 
 
 class _Run:
-    """A run under way."""
+    """A run under way. Every change of its record is on disk before the next stage, and every few seconds what is
+    spent, in all and in the stage under way, so that a kill costs no more."""
 
-    def __init__(self, site: Site, kept: _Kept, clock: Clock) -> None:
-        self.site, self.kept, self.clock = site, kept, clock
+    site: Site
+
+    def __init__(
+        self, folder: Path, name: str, options: RunOptions, record: RunRecord | None, advance: ProgressFn | None
+    ) -> None:
+        self._folder, self._name, self._quiet, self._record = folder, name, options.quiet, record
+        self._stage = ""
+        self.clock = Clock(options.budget_s, record.spent_s if record else 0.0, self._note_spent, advance, self.say)
 
     @property
     def record(self) -> RunRecord:
-        assert self.kept.record is not None
-        return self.kept.record
-
-    def keep(self, record: RunRecord) -> None:
-        """Make `record` the run's; what was spent is known already."""
-        self.kept.keep(record, self.record.spent_s)
-
-    def say(self, line: str) -> None:
-        """Write a line into the log, and show it."""
-        _say(self.site.folder / LOG_NAME, self.site.scene.name, line, quiet=self.site.options.quiet)
-
-    def to_the_end(self) -> RunRecord:
-        """Do the stages that have not ended and return the record."""
-        while pending := self._pending:
-            self._do(pending[0].name)
-        return self.record
+        assert self._record is not None
+        return self._record
 
     @property
     def decision(self) -> Decision:
         assert self.record.decision is not None
         return self.record.decision
 
-    @property
-    def _pending(self) -> list[PlannedStage]:
-        return [stage for stage in self.decision.stages if self.record.ended(stage.name) is None]
+    def keep(self, record: RunRecord) -> None:
+        """Make `record` the run's, here and on disk."""
+        self._record = replace(record, spent_s=round(self.clock.spent_s, 1))
+        write_run(self._folder, self._record)
 
-    def _do(self, name: Stage) -> None:
+    def _note_spent(self, spent_s: float) -> None:
+        if self._record is None:
+            return
+        spent_in = dict(self._record.spent_in)
+        if self._stage:
+            spent_in[self._stage] = round(spent_in.get(self._stage, 0.0) + spent_s - self._record.spent_s, 1)
+        self.keep(replace(self._record, spent_in=spent_in))
+
+    def say(self, line: str) -> None:
+        """Write a line into the log, and show it."""
+        with open(self._folder / LOG_NAME, "a", encoding="utf-8") as file:
+            file.write(f"{datetime.now(UTC).isoformat(timespec='seconds')} {line}\n")
+        if not self._quiet:
+            tell(self._name, line)
+
+    def before_stages(self, doing: str, work: Callable[[], T]) -> T:
+        """Return what comes of work that is done before there are stages. Raises InputError where the budget ends
+        first."""
+        found = self.clock.work(doing, self.clock.budget_s, work)
+        if found is None:
+            budget_s = self.clock.budget_s
+            raise InputError(
+                f"the budget of {format_wall(budget_s)} is spent while {doing}, before anything is simulated. Use "
+                f"`budget_s='{math.ceil(max(2.0 * budget_s, 60.0))}s'` or more."
+            )
+        return found
+
+    def to_the_end(self, site: Site) -> RunRecord:
+        """Do the stages that have not ended and return the record."""
+        self.site = site
+        while pending := [stage for stage in self.decision.stages if self.record.ended(stage.name) is None]:
+            self._do(pending)
+        return self.record
+
+    def _do(self, pending: list[PlannedStage]) -> None:
+        """Do the first of the stages that have not ended."""
+        name: Stage = pending[0].name
         stage, record = STAGES[name], self.record
         assert record.rates is not None
-        left_s = self.clock.budget_s - self.clock.spent_s
         there = stage.found(self.site, record) if name in (*MD_STAGES, "rollout") else None
-        may_take_s = seconds_of_first(self._pending, left_s)
+        may_take_s = seconds_of_first(pending, self.clock.budget_s - self.clock.spent_s)
         if name in MD_STAGES and there is None:  # without MD to compare with all else was in vain
             may_take_s = max(may_take_s, LEAST_MD_S * max(1.0, 0.5 * record.rates.stretch))
         if name == "report":  # it is made however long it takes, for the same reason
@@ -173,7 +244,7 @@ class _Run:
             self._ended(there, StageEntry(name, "out of time", 0.0))
             return
         self.say(f"{name}: for {may_take_s:.0f} s" if name != "report" else name)
-        self.kept.stage = name
+        self._stage = name
         try:
             done = self.clock.work(name, may_take_s, lambda: stage.work(self.site, record))
         except SurromdError as error:
@@ -185,12 +256,12 @@ class _Run:
                 raise
             return
         finally:
-            self.kept.stage = ""
+            self._stage = ""
         found = stage.found(self.site, record) if done is None else done
         if found is None:
             self._failed(name, "nothing came of it in its time")
-            return
-        self._ended(found, StageEntry(name, "out of time" if done is None else "done", 0.0))
+        else:
+            self._ended(found, StageEntry(name, "out of time" if done is None else "done", 0.0))
 
     def _failed(self, name: str, reason: str) -> None:
         self.say(f"{name} failed: {reason}")
@@ -201,9 +272,9 @@ class _Run:
 
     def _ended(self, found: RunRecord, entry: StageEntry) -> None:
         """Enter what a stage came to, and how it ended."""
-        now = self.record  # with what is spent
-        entry = replace(entry, wall_s=now.spent_in.get(entry.name, 0.0))
-        self.keep(replace(found.with_stage(entry), spent_s=now.spent_s, spent_in=now.spent_in))
+        spent_in = self.record.spent_in
+        entry = replace(entry, wall_s=spent_in.get(entry.name, 0.0))
+        self.keep(replace(found, stages=(*found.stages, entry), spent_in=spent_in))
 
     def _by_openmm(self, name: str, reason: str) -> None:
         """Go on with a stage of MD by OpenMM where SIMD replicas have failed; their good frames stay."""
@@ -220,17 +291,9 @@ class _Run:
         assert self.record.rates is not None
         left_s = max(self.clock.budget_s - self.clock.spent_s, least_budget_s(self.record.rates))
         decision = decide(self.record.rates, left_s, "md", save_every_ps=self.decision.save_every_ps)
-        ended = {entry.name for entry in self.record.stages}
-        stages = tuple(stage for stage in decision.stages if stage.name not in ended)
+        stages = tuple(stage for stage in decision.stages if self.record.ended(stage.name) is None)
         decision = replace(decision, why=(why,), stages=stages)
         self.keep(replace(self.record, decision=decision, trajectory=()))
-
-
-def _say(log: Path, name: str, line: str, *, quiet: bool) -> None:
-    with open(log, "a", encoding="utf-8") as file:
-        file.write(f"{datetime.now(UTC).isoformat(timespec='seconds')} {line}\n")
-    if not quiet:
-        tell(name, line)
 
 
 def _taken_up(record: RunRecord, options: RunOptions) -> RunRecord:
@@ -246,14 +309,6 @@ def _taken_up(record: RunRecord, options: RunOptions) -> RunRecord:
     decision = replace(longer, why=record.decision.why, equilibrate_ps=record.decision.equilibrate_ps)
     ended = tuple(entry for entry in record.stages if entry.status == "done" and entry.name != "report")
     return replace(record, decision=decision, stages=ended, outcome=None, settings=settings_of_run(options))
-
-
-def _before_stages(clock: Clock, doing: str, work: Callable[[], T]) -> T:
-    """Return what comes of work that is done before there are stages. Raises InputError where the budget ends first."""
-    found = clock.work(doing, clock.budget_s, work)
-    if found is None:
-        raise InputError(f"the budget is spent while {doing}; give more `budget_s`.")
-    return found
 
 
 def _decide(

@@ -1,11 +1,13 @@
-"""The record of a run, run.json: what was asked for, measured, decided and done, and what came of it."""
+"""The record of a run, run.json: what was asked for, measured, decided and done, and what came of it; and what `run`
+returns: the record as a dictionary with its headline, its files, its picture."""
 
 from __future__ import annotations
 
 import json
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field
+from html import escape
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from surrogate.verbs.run.decision import Decision
 from surrogate.verbs.run.rates import Rates
@@ -14,7 +16,10 @@ from systems.files.outside import content
 from systems.files.schema import built, parsed
 from systems.files.whole_file import create_whole
 
-RUN_NAME = "run.json"
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+RUN_NAME, ANSWER_NAME, REPORT_NAME = "run.json", "equilibrium.json", "report.html"
 FORMAT = 4
 # What may change from one sitting to the next.
 _FREE = frozenset({"quiet", "resume", "overwrite", "dry_run", "workers", "scheduler"})
@@ -82,10 +87,6 @@ class RunRecord:
         """Return how a stage ended, None where it has not."""
         return next((entry for entry in self.stages if entry.name == name), None)
 
-    def with_stage(self, entry: StageEntry) -> RunRecord:
-        """Return the record with one more stage that has ended."""
-        return replace(self, stages=(*self.stages, entry))
-
     def to_dict(self) -> dict[str, Any]:
         """Return JSON-able values."""
         return {"format": FORMAT, **asdict(self)}
@@ -128,3 +129,65 @@ def read_run(folder: Path) -> RunRecord:
         raise InputError(f"{folder} holds no {RUN_NAME}: there is no run to go on with.") from None
     except (OSError, ValueError, TypeError) as error:
         raise InputError(f"{path} cannot be read as the record of a run ({error}).") from error
+
+
+class RunResult(dict[str, Any]):
+    """The record of a run, as `run.json` holds it, and what can be done with it.
+
+    `result["outcome"]`, `result["decision"]` and the rest are the record's entries; a notebook shows the three lines.
+    """
+
+    @classmethod
+    def of(cls, folder: Path) -> RunResult:
+        """Return the result of a run's folder, done or not. Raises InputError when there is none."""
+        record = read_run(folder)
+        done = record.outcome.headline if record.outcome else f"not done; {len(record.stages)} stages have ended"
+        plain: dict[str, Any] = json.loads(json.dumps(record.to_dict()))
+        return cls({"file": str(folder), "type": "run", "summary": done} | plain)
+
+    @property
+    def folder(self) -> Path:
+        return Path(self["file"])
+
+    @property
+    def headline(self) -> str:
+        """Use MD's answer or not, for what, and why."""
+        return str(self["summary"])
+
+    @property
+    def trajectory(self) -> list[Path]:
+        """Files of the trajectory that was evaluated: the surrogate's, or half of MD."""
+        return [self.folder / file for file in self["trajectory"]]
+
+    @property
+    def md(self) -> list[Path]:
+        """Files of all MD that the answer is of; `sm.frame_weights` gives the weights of their frames."""
+        own = self["trajectory"] if (self["decision"] or {}).get("way") == "md" else []
+        return [self.folder / file for file in (*own, *self["held_out"])]
+
+    @property
+    def report(self) -> Path:
+        return self.folder / REPORT_NAME
+
+    @property
+    def answer(self) -> dict[str, Any]:
+        """States, free energies, maps and timescales by MD (`equilibrium.json`); empty where MD tells none."""
+        path = self.folder / ANSWER_NAME
+        return dict(parsed(content(path))) if path.is_file() else {}
+
+    def plot(self) -> Figure:
+        """Return a matplotlib figure of the populations of all states by MD, with their errors, beside the
+        surrogate's, and of the first residues' free energies over φ and ψ."""
+        from surrogate.comparison.report.figures import answer_overview
+
+        return answer_overview(self["molecule"], self.answer)
+
+    def _repr_html_(self) -> str:
+        """Return the three lines and where the report is, for a notebook."""
+        outcome = self["outcome"]
+        if outcome is None:
+            return f"<p>{escape(self.headline)}</p>"
+        first, *rest = outcome["in_short"]
+        said = "<br>".join(escape(line) for line in (*rest, outcome["details"]) if line)
+        link = escape(str(self.report))
+        return f'<p><b>{escape(first)}</b><br>{said}<br><a href="{link}">{link}</a></p>'

@@ -1,4 +1,5 @@
-"""The stages of a run, each one call of a verb: its files stay, so that it can be stopped at any moment and gone on."""
+"""The stages of a run, each one call of a verb: its files stay, so that it can be stopped at any moment and gone on.
+The last one is the report, which puts into words what came of the run."""
 
 from __future__ import annotations
 
@@ -12,27 +13,27 @@ from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from surrogate.comparison.verdict import LEAST_SAMPLES
 from surrogate.verbs.compare import compare
+from surrogate.verbs.inputs import summarised_outputs
 from surrogate.verbs.options import MDSettings, ReferenceOptions, RolloutOptions, RunOptions, TrainOptions
-from surrogate.verbs.outputs import summarised_outputs
-from surrogate.verbs.rollout import rollout
-from surrogate.verbs.run.decision import Decision, Stage, errors_in_words, expected_errors, md_ps, table
-from surrogate.verbs.run.outcome_words import Costs, lines_of, outcome
+from surrogate.verbs.run.decision import Decision, Stage, Way, errors_in_words, expected_errors, md_ps, table
 from surrogate.verbs.run.rates import Rates, Rolls, rollout_rate
-from surrogate.verbs.run.run_record import RunRecord
-from surrogate.verbs.run.run_result import ANSWER_NAME, REPORT_NAME
+from surrogate.verbs.run.run_record import ANSWER_NAME, REPORT_NAME, Outcome, RunRecord
+from surrogate.verbs.simulate import rollout
 from surrogate.verbs.train import train
 from systems.errors import InputError, SimulationError
 from systems.files.whole_file import create_whole
 from systems.options import Preparation
-from systems.units import format_time_ps
+from systems.units import format_time_ps, format_wall
 
 if TYPE_CHECKING:
     import numpy as np
     import numpy.typing as npt
 
     from md_reference.run.config import MDConfig
-    from surrogate.comparison.comparison import Comparison
+    from surrogate.comparison.comparison import Comparison, Evaluation, Summary
+    from surrogate.comparison.equivalent_time import EquivalentTime
     from surrogate.comparison.md_answer import Answer
     from systems.scene import Scene
 
@@ -271,6 +272,128 @@ def _rolled(site: Site, record: RunRecord) -> RunRecord | None:
     return replace(record, trajectory=files) if files else None
 
 
+# ---- the report ----------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Costs:
+    """Wall seconds of a candidate: of rolling it, and of training its weights here; `md_ps_per_s`: what MD simulates in
+    such a second by the fastest way here, `by` which and in how many `replicas`; `budget_s`: of all."""
+
+    rolling_s: float
+    training_s: float
+    md_ps_per_s: float
+    budget_s: float
+    replicas: int = 1
+    by: str = "OpenMM"
+
+
+def outcome(
+    way: Way, comparison: Comparison, costs: Costs, answer: Answer | None = None, notes: tuple[str, ...] = ()
+) -> Outcome:
+    """Return what a run comes to: its MD's `answer`, and a comparison of its trajectory with its held-out MD."""
+    evaluated = comparison.evaluations[0]
+    held = [comparison.reference, *([] if comparison.replicate is None else [comparison.replicate])]
+    found = None
+    if evaluated.equivalent_time_words:
+        found = next((each for each in evaluated.equivalent_time if each.kind == "distribution"), None)
+    rolled, speed_up = _length([evaluated.summary]), None
+    said = f"{rolled} of the surrogate" if way != "md" else f"{rolled} of MD, evaluated by {_length(held)}"
+    if found is None:
+        said += f": {evaluated.status}, without an equivalent MD time."
+    else:
+        said += f": equivalent to {found.in_words()} of MD by its {found.measure}."
+    if found is not None and way != "md" and costs.md_ps_per_s > 0.0:
+        speed_up, words = _least_speed_up(found, costs)
+        said += f" {words}"
+    lines = evaluated.in_short if answer is None else answer.in_short
+    on_surrogate = answer.on_surrogate if answer else ""
+    if answer is not None and on_surrogate and not answer.is_sure and not answer.is_by_surrogate:
+        on_surrogate = "MD has not converged, and cannot say whether the surrogate's populations are right."
+    return Outcome(
+        headline=" ".join(lines),
+        in_short=lines,
+        details=" ".join(filter(None, (on_surrogate, said, _remedy(comparison, costs)))),
+        status=evaluated.status,
+        verdict=evaluated.verdict,
+        held_out_ps=sum(a.total_ps for a in held),
+        rolled_ps=evaluated.summary.total_ps,
+        equivalent_time=found.in_words() if found else "",
+        speed_up=speed_up,
+        on_surrogate=on_surrogate,
+        converged=answer.holds and not answer.missing if answer else False,
+        notes=notes,
+    )
+
+
+def lines_of(way: Way, evaluated: Evaluation, answer: Answer | None) -> tuple[str, str, str]:
+    """Return the three lines on top of the report, which say of the trajectory what MD's answer says: a comparison
+    counts all frames of MD alike, and MD's transitions weigh them."""
+    if answer is None or evaluated.status == "broken":
+        return evaluated.in_short
+    if way == "md" or answer.is_by_surrogate:
+        return answer.in_short
+    rolled = [s for s in answer.states if s.surrogate is not None and not s.missing]
+    off = [s for s in rolled if s.differs]
+    if not answer.is_sure or not rolled:
+        use, for_what = "Not known yet whether the surrogate can be used.", "It found the states that MD began in."
+        return use, for_what, "Why: the MD it is compared with has not converged."
+    right = f"Right: populations of {len(rolled) - len(off)} of {len(rolled)} states."
+    if off:
+        wrong = ", ".join(f"{s.torsion} {s.state}" for s in off[:3]) + (", and more" if len(off) > 3 else "")
+        return "Use MD's populations, not the surrogate's.", f"{right} Wrong: {wrong}.", f"Why: {answer.on_surrogate}"
+    if answer.method == "plain averages" or evaluated.status in ("agrees", "close"):
+        return evaluated.in_short
+    return "Use the surrogate for populations.", right, f"Why: {answer.on_surrogate}"
+
+
+def _length(summaries: list[Summary]) -> str:
+    """Return such as '32 replicas of 3.8 ns', which is no length of one run."""
+    n = sum(a.n_segments for a in summaries)
+    each = format_time_ps(sum(a.total_ps for a in summaries) / n, 2)
+    return f"{n} replicas of {each}" if n > 1 else each
+
+
+def _remedy(comparison: Comparison, costs: Costs) -> str:
+    """Return what would tell more; a longer budget where its replicas outlast the slowest relaxation that was seen."""
+    found, evaluated = comparison.convergence, comparison.evaluations[0]
+
+    def budget(times: float) -> str:
+        return f"a budget of about {format_wall(float(f'{costs.budget_s * times:.2g}'))}"
+
+    if found is not None and not found.converged and not found.n_replicas:
+        return f"the MD it is compared with is too short to be tested: {found.reasons[0]}."
+    if found is not None and not found.converged:
+        said = f"MD, {found.verdict.rstrip('.')}; {found.remedy}"
+        if found.needed_ps is None or found.needed_ps <= found.replica_ps:
+            return f"{said}."
+        return f"{said}: {budget(found.needed_ps / found.replica_ps)}."
+    n = evaluated.effective_samples
+    if evaluated.status == "undecided" and 0.0 < n < LEAST_SAMPLES:
+        return (
+            f"Of the slowest motion {n:.2g} independent samples were seen, of {LEAST_SAMPLES} that it takes: "
+            f"{budget(LEAST_SAMPLES / n)} would tell."
+        )
+    return ""
+
+
+def _least_speed_up(found: EquivalentTime, costs: Costs) -> tuple[float, str]:
+    """Return what MD of an equivalent MD time's lower end would cost, over what the candidate did, training here
+    included; and this in words."""
+    least_ps = found.equivalent_ps if found.low_ps is None and found.bound == "at least" else found.low_ps or 0.0
+    # Where MD at hand ends first, the part of the rollout that comes as near is what it is the equivalent MD time of.
+    spent_s = max(costs.training_s + found.share * costs.rolling_s, 1e-9)
+    speed_up = (0.0 if found.bound == "less than" else least_ps) / (costs.md_ps_per_s * spent_s)
+    each = format_time_ps(costs.md_ps_per_s * spent_s / costs.replicas, 2)
+    bought = f"{costs.replicas} replicas of {each}" if costs.replicas > 1 else each
+    training = f", training included ({format_wall(costs.training_s)})" if costs.training_s else ""
+    said = "Speed-up at equal accuracy" if speed_up >= 1.0 else "No speed-up at equal accuracy is shown:"
+    return speed_up, (
+        f"{said} at least {speed_up:.2g}; in the {format_wall(spent_s)} that took{training}, MD by {costs.by}, the "
+        f"fastest here, makes {bought}."
+    )
+
+
 def costs_of(record: RunRecord, comparison: Comparison, held_ps: float) -> Costs:
     """Return what the trajectory that a comparison evaluates has cost, beside what `held_ps` of the run's own held-out
     MD did."""
@@ -333,7 +456,7 @@ def _report(site: Site, record: RunRecord) -> RunRecord:
     evaluated = replace(evaluated, in_short=lines_of(decision.way, evaluated, answer))
     said = (*(() if answer is None else (UNWEIGHTED,)), *notable(comparison.notes))
     comparison = replace(comparison, notes=said, evaluations=(evaluated,))
-    lines = [*(answer.table() if answer else ()), *table(rates, decision, site.options.budget_s)]
+    lines = [*(answer.table() if answer else ()), *table(rates, decision, site.options.budget_s).items()]
     if answer is not None and answer.timescales_ps:
         errors = expected_errors(rates, record.settings["budget_s"], answer.timescales_ps[0], answer.model_error)
         slow = format_time_ps(answer.timescales_ps[0], 2)
@@ -352,14 +475,10 @@ def _report(site: Site, record: RunRecord) -> RunRecord:
     return replace(record, outcome=found)
 
 
-def _nothing(site: Site, record: RunRecord) -> RunRecord | None:
-    return None
-
-
 STAGES: dict[str, StageOf] = {
     "md": _md_stage("md", "trajectory/md", 0),
     "held-out md": _md_stage("held-out md", "reference/held_out", 1),
     "train": StageOf(_train, _trained, may_fail=True),
     "rollout": StageOf(_roll, _rolled, may_fail=True),
-    "report": StageOf(_report, _nothing),
+    "report": StageOf(_report, lambda site, record: None),
 }

@@ -49,12 +49,3 @@ def domain(alanine_dipeptide: Scene, md: np.ndarray) -> TrainingDomain:
     # The scripted model trembles less than MD moves; what is to be caught of it is its faults.
     limits = replace(limits_from_frames(alanine_dipeptide, md[:-1], md[1:]), jump_min_nm=1e-9)
     return TrainingDomain(alanine_dipeptide, LAG_PS, CONDITIONS, geometry.to_dict(), limits.to_dict())
-
-
-@pytest.fixture
-def short_energy_sample(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A tenth of the MD that energies are otherwise measured against."""
-    from surrogate.sampling import coupling
-
-    monkeypatch.setattr(coupling, "_DISCARDED_PS", 2.0)
-    monkeypatch.setattr(coupling, "_SAMPLES", 30)

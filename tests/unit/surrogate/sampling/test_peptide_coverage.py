@@ -139,4 +139,4 @@ def test_without_its_model_a_domain_of_peptides_covers_those_trained_on_alone() 
     header = read_header(weights_path("peptides"))
     assert find_deviations(build_peptide("ACE-ALA-NME"), header.domain) == ()
     unseen = find_deviations(build_peptide("ACE-LEU-SER-NME"), header.domain)
-    assert [(d.what, d.forcible) for d in unseen] == [("connectivity", False)]
+    assert [(d.what, d.forcible) for d in unseen] == [("molecule", False)]

@@ -1,4 +1,4 @@
-"""Rollouts with OpenMM beside them: MD between chunks, energies, the coupling; and parts of a molecule written."""
+"""Rollouts with OpenMM beside them: the coupling; and parts of a molecule written."""
 
 from __future__ import annotations
 
@@ -10,47 +10,18 @@ import pytest
 
 from scripted_model import (
     CONDITIONS,
-    LAG_PS,
     roll,
-    twist,
     weights_of,
 )
 from surrogate.models.weights import TrainingDomain
-from surrogate.sampling.chunks import CAUGHT, MD_BETWEEN, ChunkSampler, Guard
+from surrogate.sampling.chunks import ChunkSampler, Guard
 from surrogate.sampling.coupling import Coupling
 from surrogate.sampling.runner import RolloutConfig
-from systems.chemistry.validity import ENERGY
 from systems.errors import InputError, UnknownNameError
 from systems.scene import Scene
 
 
-def test_md_between_chunks_is_marked_and_takes_its_time(tmp_path: Path, scene: Scene, domain: TrainingDomain) -> None:
-    found = roll(tmp_path / "a.h5", scene, weights_of(domain), "flag", n_chunks=5, md_between_ps=0.2)
-    assert np.allclose(found.times, LAG_PS * np.arange(1, 41))
-    assert found.marks.tolist() == ([0] * 8 + [MD_BETWEEN] * 2) * 4
-    assert not (found.flags & np.uint16(CAUGHT)).any()
-    assert found.summary["seconds"]["md"] > 0
-    assert "mixture" in found.summary["bias"][0]
-
-
-def test_energies_of_every_kth_frame_catch_what_geometry_does_not(
-    tmp_path: Path, scene: Scene, domain: TrainingDomain, short_energy_sample: None
-) -> None:
-    found = roll(tmp_path / "a.h5", scene, weights_of(domain), "flag", n_chunks=2, energy_every=3)
-    energies = found.scalars["relaxed_energy_kj_mol"]
-    assert np.array_equal(np.flatnonzero(np.isfinite(energies)), [2, 5, 8, 11, 14])
-    assert not (found.flags & np.uint16(ENERGY)).any()
-    assert found.summary["seconds"]["energy limit"] > found.summary["seconds"]["energy"] > 0
-    # A twisted peptide bond breaks no rule of geometry, once there are no limits; its energy shows it.
-    loose = weights_of(replace(domain, limits=None), twist)
-    twisted = roll(tmp_path / "b.h5", scene, loose, "flag", n_chunks=1, energy_every=3)
-    assert twisted.summary["unchecked"] == [Guard(loose.domain).unchecked[0]]
-    assert twisted.flags.tolist() == [0, 0, ENERGY, 0, 0, 0, 0, 0]
-    drawn = [roll(tmp_path / f"{k}.h5", scene, loose, "flag", n_chunks=1, energy_every=k).flags[2] for k in (2, 4)]
-    assert drawn == [0, 0], "only every k-th frame is looked at"
-
-
-def test_md_depends_on_start_and_seed_alone(domain: TrainingDomain, md: np.ndarray, short_energy_sample: None) -> None:
+def test_md_depends_on_start_and_seed_alone(domain: TrainingDomain, md: np.ndarray) -> None:
     coupling = Coupling(weights_of(domain))
     first = coupling.simulate(md[0], 5, seed=1)
     coupling.simulate(md[9], 3, seed=5)
@@ -62,8 +33,6 @@ def test_md_depends_on_start_and_seed_alone(domain: TrainingDomain, md: np.ndarr
     kinetic = 0.5 * (domain.scene.masses_da[:, None] * longer.velocities_nm_ps**2).sum()
     assert 20.0 < kinetic < 110.0, "kJ/mol; 51 degrees of freedom have 64 at 300 K, half of it right after relaxing"
     assert np.abs(domain.scene.masses_da @ longer.velocities_nm_ps).max() < 1e-6
-    energies = [coupling.relax(x).potential_kj_mol for x in md[::10]]
-    assert max(energies) < coupling.energy_limit_kj_mol < max(energies) + 60.0
     coupling.close()
 
 
@@ -128,9 +97,18 @@ def test_settings_that_cannot_be_are_refused(domain: TrainingDomain) -> None:
         ({"guard": "repare"}, UnknownNameError, "Did you mean 'repair'"),
         ({"atoms": "none"}, InputError, "all or heavy"),
         ({"energy_every": -1}, InputError, "at least 0"),
-        ({"md_between_ps": -1.0}, InputError, "at least 0"),
         ({"solver_steps": 0}, InputError, "at least 1"),
     ):
         with pytest.raises(error, match=said):
             RolloutConfig(time_ps=1.0, **wrong)  # type: ignore[arg-type]
     assert Guard(domain).unchecked == ()
+    assert Guard(replace(domain, limits=None)).unchecked == (
+        "angles, flat centres, jumps, stillness and drift: the weights carry no limits",
+    )
+
+
+def test_energies_are_compared_for_learned_potentials_alone(
+    tmp_path: Path, scene: Scene, domain: TrainingDomain
+) -> None:
+    with pytest.raises(InputError, match="`energy_every` is for learned potentials"):
+        roll(tmp_path / "a.h5", scene, weights_of(domain), "flag", energy_every=3)

@@ -50,7 +50,7 @@ def test_that_there_are_such_quantities() -> None:
     named = {name for _, name in QUANTITIES}
     assert {"time_ps", "save_every_ps", "lag_ps", "budget_s", "temperature_k", "friction_per_ps", "timestep_ps",
             "hydrogen_mass_da", "equilibrate_ps", "padding_nm", "ionic_strength_molar", "pressure_bar",
-            "md_between_ps", "longest_lag_ps"} <= named  # fmt: skip
+            "longest_lag_ps"} <= named  # fmt: skip
 
 
 def test_a_reference_asked_for_in_texts_is_the_one_asked_for_in_numbers(here: Path) -> None:

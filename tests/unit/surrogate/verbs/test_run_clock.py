@@ -10,7 +10,7 @@ import time
 
 import pytest
 
-from surrogate.verbs.run.stage_clock import Clock
+from surrogate.verbs.run.one_scene import Clock
 from systems.errors import SimulationError
 from systems.interrupts import deferred_interrupt, stop_if_asked, stop_when
 
@@ -81,7 +81,7 @@ def test_work_that_only_looks_now_and_then_is_stopped_too() -> None:
 
 
 def test_a_budget_that_is_overrun_is_said_once_while_it_happens(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("surrogate.verbs.run.stage_clock._SAVE_EVERY_S", 0.1)
+    monkeypatch.setattr("surrogate.verbs.run.one_scene._SAVE_EVERY_S", 0.1)
     said: list[tuple[str, bool]] = []
     done: list[bool] = []
 

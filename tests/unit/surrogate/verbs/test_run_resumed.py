@@ -260,7 +260,9 @@ def test_md_that_comparisons_is_made_however_late_it_is(tmp_path: Path, monkeypa
 def test_measuring_that_takes_the_budget_leaves_the_stages_the_least(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(one_scene, "measure", lambda *_: OPENMM)
     record: Any = replace(RunRecord("CCO", "CCO", "", "", {}), rates=OPENMM)
-    with pytest.raises(InputError, match="19 s are left, too few"):
+    with pytest.raises(
+        InputError, match=r"a budget of 19 s is too short: .* takes 20 s .* Use `budget_s='20s'` or more"
+    ):
         one_scene._decide(record, None, None, RunOptions(budget_s=19.0), lambda: 0.0)  # type: ignore[arg-type]
     late = one_scene._decide(record, None, None, RunOptions(budget_s=60.0), lambda: 59.0)  # type: ignore[arg-type]
     assert late.decision is not None

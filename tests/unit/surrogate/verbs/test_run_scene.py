@@ -11,10 +11,9 @@ import pytest
 
 from quick_report import evaluated_at_once
 from surrogate import api
-from surrogate.verbs.run import many_scenes, one_scene, stages
-from surrogate.verbs.run.many_scenes import molecules_in
+from surrogate.verbs.run import one_scene, run_scenes, stages
 from surrogate.verbs.run.rates import Rates, Rolls
-from surrogate.verbs.run.results_page import write_results
+from surrogate.verbs.run.run_scenes import molecules_in, write_results
 from systems.errors import InputError, SimulationError
 from systems.trajectory.codec import open_trajectory
 
@@ -148,8 +147,8 @@ def test_lines_that_are_no_molecule_are_known_before_the_budget_is_shared(
         shared.append(n)
         raise InputError("enough")
 
-    monkeypatch.setattr(many_scenes, "_share_s", share_s)
-    monkeypatch.setattr(many_scenes, "open_client", lambda **_: nullcontext())
+    monkeypatch.setattr(run_scenes, "_share_s", share_s)
+    monkeypatch.setattr(run_scenes, "open_client", lambda **_: nullcontext())
     (tmp_path / "m.smi").write_text("C1CC broken\nCCO fine\nC[Na] metal\n")
     with pytest.raises(InputError, match="enough"):
         api.run(tmp_path / "m.smi", tmp_path / "runs", budget_s=100.0, quiet=True)

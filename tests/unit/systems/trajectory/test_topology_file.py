@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from surrogate.verbs.outputs import check_outputs
+from surrogate.verbs.inputs import check_outputs
 from systems.errors import SimulationError, TrajectoryError
 from systems.scene import Scene, reordered
 from systems.trajectory.checkpoint import locked_outputs

@@ -11,11 +11,14 @@ import numpy as np
 import pytest
 
 from surrogate.comparison.read.ensemble import Ensemble, alike, load_ensemble
+from surrogate.data import collect_frames
+from surrogate.verbs.inputs import find_trajectories
 from surrogate.verbs.run.stages import notable
 from systems.chemistry.geometry import torsion
 from systems.errors import InputError, OutOfDomainError, TrajectoryError
 from systems.scene import Scene
 from systems.trajectory.codec import open_writer
+from systems.trajectory.joined import join
 
 Save = Callable[..., Path]
 
@@ -111,6 +114,27 @@ def test_replicas_become_segments_and_costs_add_up(save: Save, frames: np.ndarra
     assert any("differ in temperature_k (300.0, 301.0)" in note for note in ensemble.notes)
     without = save("none.h5", frames, steps(60))
     assert "cost" not in load_ensemble([paths[0], without]).record, "half a cost is no cost"
+
+
+@pytest.mark.parametrize("suffix", [".h5", ".dcd", ".xtc"])
+def test_replicas_in_one_file_are_read_as_those_in_many(save: Save, frames: np.ndarray, suffix: str) -> None:
+    costs = [{"cost": {"wall_s": 2.0}, "seed": 1}, {"cost": {"wall_s": 3.0}, "seed": 2}]
+    parts = [frames[:20], frames[20:]]  # what follows on in time, so that nothing but the record tells
+    paths = [save(f"a_r{k}{suffix}", parts[k], steps(len(parts[k])), record=costs[k]) for k in range(2)]
+    joined = join(paths, paths[0].with_name(f"a{suffix}"))
+    one, many = load_ensemble([joined]), load_ensemble(paths)
+    assert one.segment_lengths == many.segment_lengths == [20, 40]
+    for a, b in zip(one.segments, many.segments, strict=True):
+        np.testing.assert_allclose(a, b, atol=6e-4 if suffix == ".xtc" else 1e-6)
+    assert one.record["cost"] == many.record["cost"] == {"wall_s": 5.0}
+    assert load_ensemble([joined], lag_ps=2.0).segment_lengths == [20, 40]
+    assert any("2 replicas in one file" in note for note in one.notes)
+    assert find_trajectories(joined.parent) == paths, "nothing is counted twice"
+    assert find_trajectories(joined) == [joined]
+    plain = save(f"b{suffix}", frames, steps(60))
+    assert load_ensemble([plain]).segment_lengths == [60]
+    with pytest.raises(InputError, match="joins 2 replicas"):
+        collect_frames([joined])
 
 
 def test_a_jump_in_time_begins_a_segment(save: Save, frames: np.ndarray) -> None:

@@ -1,4 +1,5 @@
-"""Files that verbs write and read: checked before the work starts, reported at its end, replicas found by pattern."""
+"""What verbs take and leave: scenes of the names or files that a user gives, trajectories found by pattern, outputs
+that are checked before the work starts and reported when it is interrupted."""
 
 from __future__ import annotations
 
@@ -7,13 +8,69 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from glob import glob
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 from md_reference.campaign.manifest import campaign_folder, campaign_trajectories
-from surrogate.verbs.options import Trajectories
+from surrogate.verbs.options import Trajectories, tell
+from systems.chemistry.graph import backbone_torsions, molecule_key
 from systems.errors import InputError
+from systems.library import named_scenes
+from systems.options import Preparation, part_of
 from systems.trajectory.checkpoint import checkpoint_path, frames_in
 from systems.trajectory.codec import WRITTEN
 from systems.trajectory.companion_writer import refuse_other_companions
+
+if TYPE_CHECKING:
+    from systems.scene import Scene
+
+
+def systems(name: str | None = None) -> list[dict[str, Any]]:
+    """Return what the library holds: one record per named scene, or the one asked for, with its protocols and atoms.
+    Raises UnknownNameError (with the nearest name)."""
+    if name is None:
+        groups = named_scenes.groups()
+        return [_describe(each) | {"group": group} for group in groups for each in groups[group]]
+    scene = named_scenes.load(name)
+    record = _describe(name) | {
+        "n_bonds": len(scene.bonds),
+        "residues": list(scene.residue_names),
+        "atoms": list(scene.atom_names),
+        "mass_da": float(scene.masses_da.sum()),
+        "charge_e": int(scene.formal_charges.sum()),
+        "torsions": {key: len(quads) for key, quads in backbone_torsions(scene).items() if len(quads)},
+        "topology_hash": scene.topology_hash,
+        "molecule_key": molecule_key(scene),
+        "protocols": {
+            each: _written(named_scenes.find_protocol(each).settings) for each in named_scenes.entry(name).protocols
+        },
+    }
+    if scene.interactions is not None:
+        settings, source = named_scenes.entry(name).own_settings, named_scenes.entry(name).source
+        record |= {"law": scene.interactions, "settings": _written(settings), "source": source}
+    return [record]
+
+
+def _describe(name: str) -> dict[str, Any]:
+    scene, title = named_scenes.load(name), named_scenes.entry(name).title
+    return {"name": name, "title": title, "n_atoms": scene.n_atoms, "formula": scene.formula}
+
+
+def _written(settings: dict[str, Any]) -> dict[str, Any]:
+    """Return settings as they are printed."""
+    return {key: "natural" if value is None else value for key, value in settings.items()}
+
+
+def prepare_scene(scene: str | Path | Scene, options: Preparation, *, quiet: bool) -> Scene:
+    """Return a Scene for what a user may write, a path as such too; what had to be repaired is said on stderr. Raises
+    what `systems.library.named_scenes.prepare` raises."""
+    if not isinstance(scene, str | Path):
+        return scene
+    scene = str(scene)
+    prepared = named_scenes.prepare(scene, options=part_of(options, Preparation))
+    if not quiet:
+        for line in prepared.provenance.get("repairs", []):
+            tell(scene, line)
+    return prepared
 
 
 def check_outputs(
@@ -49,15 +106,9 @@ def summarised_outputs(paths: Sequence[Path], *, resumable: str = "") -> Iterato
         yield
     except KeyboardInterrupt:
         counts = {path: frames_in(path) for path in paths if path.exists() or checkpoint_path(path).exists()}
-        raise KeyboardInterrupt(f"{_kept(counts)}; {resumable}" if counts else "nothing was written") from None
-
-
-def _kept(counts: dict[Path, int]) -> str:
-    if len(counts) <= 2:
-        return ", ".join(f"{path} holds {frames} frames" for path, frames in counts.items())
-    first, *_, last = counts
-    fewest, most = min(counts.values()), max(counts.values())
-    return f"{first} to {last.name} hold {most if fewest == most else f'{fewest} to {most}'} frames each"
+        kept = ", ".join(f"{path} holds {frames} frames" for path, frames in list(counts.items())[:2])
+        kept += f", and so on for {len(counts)} files" if len(counts) > 2 else ""
+        raise KeyboardInterrupt(f"{kept}; {resumable}" if counts else "nothing was written") from None
 
 
 def find_trajectories(spec: Trajectories, *, verify: bool = False) -> list[Path]:
@@ -78,7 +129,7 @@ def find_trajectories(spec: Trajectories, *, verify: bool = False) -> list[Path]
     if path.is_dir():
         files = [p for p in sorted(path.iterdir()) if not p.name.endswith(".meta.h5")]
         for suffixes in ((".h5", ".hdf5"), (".dcd",), (".xtc",)):
-            found = [p for p in files if p.suffix.lower() in suffixes]
+            found = _counted_once([p for p in files if p.suffix.lower() in suffixes])
             if found:
                 return found
         raise InputError(f"{path}: no trajectory (.h5, .dcd, .xtc) in this folder.")
@@ -89,8 +140,24 @@ def find_trajectories(spec: Trajectories, *, verify: bool = False) -> list[Path]
         parts = [part.strip() for part in text.split(",") if part.strip()]
         return [p for part in parts for p in find_trajectories(part, verify=verify)]
     if any(c in text for c in "*?["):
-        found = [Path(p) for p in sorted(glob(text)) if not p.endswith(".meta.h5")]
+        found = _counted_once([Path(p) for p in sorted(glob(text)) if not p.endswith(".meta.h5")])
         if found:
             return found
         raise InputError(f"{text}: no file matches.")
     raise InputError(f"{text}: no such file.")
+
+
+def _counted_once(found: list[Path]) -> list[Path]:
+    """Return files without those that join others of them, which would be counted twice."""
+    from systems.trajectory.codec import open_trajectory
+    from systems.trajectory.joined import KEY
+
+    kept = []
+    for path in found:
+        if path.with_name(f"{path.stem}_r0{path.suffix}") in found:
+            with open_trajectory(path) as reader:
+                if KEY in reader.record:
+                    sys.stderr.write(f"{path} joins replicas that are taken one by one, and is left out\n")
+                    continue
+        kept.append(path)
+    return kept

@@ -1,9 +1,12 @@
-"""What `train` chooses for its references, how it says so, and that the file of --explain gives the same training."""
+"""What `train` chooses for its references and says, what it refuses, and the verdict that it ends with."""
 
 from __future__ import annotations
 
+import json
+import shutil
 import tomllib
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,16 +15,18 @@ from safetensors.numpy import load_file
 
 import surrogate as sm
 from command_line import SMALL_LAM_SLIDE, run
-from surrogate.data import References
-from surrogate.models.architecture import TrainingRequest, toml_text
+from surrogate import api
+from surrogate.data import References, TrainingFrames
+from surrogate.models.architecture import TrainingRequest, toml_text, weights_path
 from surrogate.models.lam_slide import trainer as choices
 from surrogate.models.lam_slide.model import LamSlideConfig
 from surrogate.models.lam_slide.trainer import TrainingConfig, train_lam_slide
 from surrogate.models.peptides.layout import PeptideConfig
 from surrogate.models.peptides.trainer import PeptideTraining
-from surrogate.models.weights import load_weights
+from surrogate.models.weights import Weights, load_weights, save_weights
 from surrogate.sampling.domain import match_domain
-from systems.errors import InputError, OutOfDomainError
+from surrogate.verbs.train import TrainingVerdict, compare_training, word_of
+from systems.errors import InputError, OutOfDomainError, UnknownNameError
 from systems.library.named_scenes import prepare
 from systems.prepare.peptide import build_peptide
 from systems.scene import Scene
@@ -195,3 +200,130 @@ def test_a_record_comes_back_from_its_toml() -> None:
     expected = {"arch": "a", "model": {"n": 3, "x": 1e-3, "on": True, "text": 'q"\\', "list": [1.5, "b"],
                                        "deep": {"quad": [1, 2], "empty": []}}, "training": {}}  # fmt: skip
     assert found == expected
+
+
+SMALL = """
+[model.autoencoder]
+latent_dim = 12
+width = 64
+head_dim = 16
+[model.approximator]
+chunk_frames = 8
+width = 64
+n_layers = 2
+n_heads = 2
+auxiliary_frames = 2
+"""
+
+
+@pytest.fixture(scope="module")
+def references(
+    harmonic_frames: TrainingFrames, alanine_dipeptide: Scene, tmp_path_factory: pytest.TempPathFactory
+) -> list[Path]:
+    folder = tmp_path_factory.mktemp("references")
+    record = {"kind": "reference", "force_field": "ff14SB", "solvent": "obc2", "temperature_k": 300.0}
+    paths = []
+    for k in range(2):
+        paths.append(folder / f"r{k}.h5")
+        with open_writer(paths[-1], alanine_dipeptide, record) as writer:
+            writer.append(
+                harmonic_frames.positions_nm(np.arange(400 * k, 400 * (k + 1))), 10.0 * (np.arange(400) + 1.0)
+            )
+    return paths
+
+
+def test_too_short_a_training_is_called_unusable_and_told_what_would_help(
+    tmp_path: Path, references: list[Path], capfd: pytest.CaptureFixture[str]
+) -> None:
+    config = tmp_path / "small.toml"
+    config.write_text(SMALL)
+    out = api.train(references, tmp_path / "m.safetensors", config=config, steps=10)
+    said = capfd.readouterr().err
+    verdict = json.loads((tmp_path / "m.verdict.json").read_text())
+    assert verdict["word"] == "not usable" and verdict["percent_valid"] < 50.0
+    assert verdict["steps"] == {"autoencoder": 2, "flow": 8} and verdict["validation"]["flow"]["validation_flow"] > 0
+    assert "autoencoder 2 steps, flow 8 steps; validation error" in said and "not usable as it is" in said
+    advice = " ".join(verdict["advice"])
+    assert "more minutes" in advice and "800 frames are few" in advice
+    assert out.exists() and not list(tmp_path.glob("*.h5"))
+
+
+def test_weights_that_are_good_are_called_usable(tmp_path: Path) -> None:
+    path = tmp_path / "good.safetensors"
+    shutil.copy(weights_path("alanine-dipeptide"), path)
+    verdict = compare_training(path)
+    assert verdict.word == "usable" and verdict.percent_valid > 99.0 and verdict.advice == ()
+    assert "usable; whether populations" in verdict.lines()[-1]
+
+
+def test_weights_that_stand_still_are_not(tmp_path: Path, small_weights: Weights) -> None:
+    """Valid as molecules go, and no motion: the guards' limit of stillness set above what this network moves."""
+    limits = small_weights.domain.limits
+    assert limits is not None
+    domain = replace(small_weights.domain, limits={**limits, "jump_min_nm": 1.0, "jump_max_nm": 10.0})
+    path = tmp_path / "still.safetensors"
+    save_weights(path, small_weights.model, domain, small_weights.provenance)
+    verdict = compare_training(path)
+    assert verdict.word == "not usable" and any("hardly a change" in reason for reason in verdict.reasons)
+    assert load_weights(path).domain.limits is not None
+
+
+@pytest.mark.parametrize(("percent", "stopped", "said"), [
+    (99.5, "", "usable; whether"), (95.0, "", "usable with `guard"), (69.0, "", "not usable"),
+    (99.5, "replica 0, in its first chunk", "not usable"),
+])  # fmt: skip
+def test_the_words(percent: float, stopped: str, said: str) -> None:
+    word = word_of(percent, stopped)
+    verdict = TrainingVerdict({"flow": 5}, {"flow": {"validation_flow": 0.25}}, 744.0, 744, percent, {}, stopped, word,
+                              ("more minutes",))  # fmt: skip
+    assert said in verdict.lines()[-1] and "validation error: flow 0.25" in verdict.lines()[0]
+    assert (stopped in "\n".join(verdict.lines())) and ("what would help" in verdict.lines()[-1]) == (word != "usable")
+
+
+def refusal(tmp_path: Path, scene: str | list[str] = "smiles:O", **options: object) -> str:
+    asked = {"level": "gfn2-xtb", "steps": 5, "quiet": True, **options}
+    with pytest.raises(InputError) as caught:
+        api.train(scene, tmp_path / "w.safetensors", **asked)  # type: ignore[arg-type]
+    assert not list(tmp_path.iterdir())
+    return str(caught.value)
+
+
+def test_what_means_nothing_for_a_potential_is_refused(tmp_path: Path) -> None:
+    assert "reference of MD" in refusal(tmp_path, level="mm")
+    assert "learns from trajectories" in refusal(tmp_path, arch="lam-slide")
+    assert "`start_from`" in refusal(tmp_path, start_from="paracetamol-gfn2-xtb", arch="painet")
+    assert "`longest_lag_ps`" in refusal(tmp_path, longest_lag_ps=1.0)
+    assert "budget_s" in refusal(tmp_path, steps=None)
+    assert "one molecule" in refusal(tmp_path, scene=["smiles:O", "smiles:CO"])
+    assert "ensemble" in refusal(tmp_path, model={"ensemble": "npt"})
+    assert "Did you mean 'rounds'" in refusal(tmp_path, training={"round": 3})
+    with pytest.raises(UnknownNameError, match="gfn2-xtb"):
+        api.train("smiles:O", tmp_path / "w.safetensors", level="gfn2", steps=5)
+
+
+def test_trajectories_say_too_little_about_forces(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"level='gfn2-xtb'"):
+        api.train("reference.h5", tmp_path / "w.safetensors", arch="painet-potential", steps=5)
+
+
+@pytest.mark.parametrize("answered", [True, False])
+def test_an_interrupted_training_says_that_its_samples_are_kept(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, answered: bool
+) -> None:
+    def stopped(*_: object) -> Path:
+        if answered:
+            (tmp_path / "w.samples.safetensors").touch()
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("surrogate.verbs.train.learn_molecule", stopped)
+    with pytest.raises(KeyboardInterrupt) as caught:
+        api.train("smiles:O", tmp_path / "w.safetensors", level="gfn2-xtb", steps=5, quiet=True)
+    assert ("w.samples.safetensors" in str(caught.value)) is answered
+    assert ("`resume=True`" in str(caught.value)) is answered
+
+
+def test_a_training_that_is_done_is_left_alone_and_says_so(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "w.safetensors"
+    out.write_bytes(b"weights")
+    api.train("smiles:O", out, level="gfn2-xtb", budget_s="1h", resume=True)
+    assert "w.safetensors: this training is done" in capsys.readouterr().err and out.read_bytes() == b"weights"
