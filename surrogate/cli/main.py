@@ -1,5 +1,5 @@
 """The command line: parsing and printing only. Every verb is one call of `surrogate.api`, which is loaded when it runs;
-`bench` is a call of `surrogate.bench`."""
+`bench` and `stress` are calls of `surrogate.bench`."""
 
 from __future__ import annotations
 
@@ -40,6 +40,7 @@ from surrogate.verbs.options import (
     ReferenceOptions,
     RolloutOptions,
     RunOptions,
+    StressOptions,
     TrainOptions,
     WindowsOptions,
     said,
@@ -470,16 +471,41 @@ def cost_error(
     """
     from surrogate.bench import cost_error as bench
 
-    is_quiet = options.quiet or as_json
-    result = bench.cost_error(
-        reference, replicate, weights, out, options,
-        report=lambda line: None if is_quiet else typer.echo(f"running: {line}", err=True),
+    _measure(
+        lambda report: bench.cost_error(reference, replicate, weights, out, options, report=report),
+        bench.markdown, f"{out}: cost_error.json, .md and .svg", as_json, options.quiet,
     )  # fmt: skip
+
+
+@app.command()
+@with_options
+def stress(
+    weights: Annotated[str, typer.Argument(metavar="WEIGHTS", help="Name of shipped weights, or a .safetensors file.")],
+    out: FolderOpt = Path("surromd-stress"),
+    *,
+    options: StressOptions,
+    as_json: JsonOpt = False,
+) -> None:
+    """Stress-test WEIGHTS: long rollouts, unusual inputs, precision, beside OpenMM."""
+    from surrogate.bench import stress as bench
+
+    _measure(
+        lambda report: bench.stress(weights, out, options, report=report),
+        bench.markdown, f"{out}: stress.json, stress.md", as_json, options.quiet,
+    )  # fmt: skip
+
+
+def _measure(
+    work: Callable[[Callable[[str], None]], dict[str, Any]], markdown: Callable[[Any], str], files: str, as_json: bool,
+    quiet: bool,
+) -> None:  # fmt: skip
+    """Run a benchmark, saying what it does; print what it has found, and which files it has written."""
+    result = work(lambda line: None if quiet or as_json else typer.echo(f"running: {line}", err=True))
     if as_json:
         print_json(result)
-    elif not options.quiet:
-        typer.echo(bench.markdown(result))
-        typer.echo(f"{out}: cost_error.json, .md and .svg")
+    elif not quiet:
+        typer.echo(markdown(result))
+        typer.echo(files)
 
 
 # ---- the process ----------------------------------------------------------------------------------------------------

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import typer
 
-from surrogate.verbs.options import VERB_OPTIONS, CostErrorOptions
+from surrogate.verbs.options import VERB_OPTIONS, CostErrorOptions, StressOptions
 from systems.files.outside import printable
 from systems.options import Option, options_of
 
@@ -28,7 +28,7 @@ _ARGUMENTS = {"out": "--out", "weights": "--weights", "config": "--config"}
 @cache
 def _known() -> dict[str, Option]:
     # Of a name that several have the last one counts.
-    kinds = [CostErrorOptions, *VERB_OPTIONS.values()]
+    kinds = [CostErrorOptions, StressOptions, *VERB_OPTIONS.values()]
     return {name: found for kind in kinds for name, found in options_of(kind).items()}
 
 

@@ -12,7 +12,7 @@ from typing import Any
 
 from md_reference.forces.spec import ForceFieldSpec, WaterBox
 from md_reference.run.config import MDConfig
-from surrogate.sampling.config import RolloutConfig
+from surrogate.sampling.config import GUARDS, RolloutConfig
 from systems.options import Preparation, from_field, option
 from systems.units import Quantity, parse_time_ps
 
@@ -238,6 +238,29 @@ class Sweep:
 @dataclass(frozen=True, kw_only=True)
 class CostErrorOptions(CostErrorConfig, Sweep, Quiet):
     """Options of `bench cost-error`: what is the same for all settings, and which settings."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class StressOptions(Seeded, Quiet):
+    """Options of `stress`."""
+
+    frames: Sequence[int] | None = option(
+        "Rollout length in frames, all replicas together; repeatable.", None, within=(1, None), unset="10000 and 100000"
+    )
+    replicas: int | None = option("Number of rollout replicas.", None, within=(1, None), unset="16")
+    guards: Sequence[str] = option(
+        "Guard policy of the rollouts; repeatable.", ("flag", "repair"), choices=GUARDS, words=("guard",)
+    )
+    sections: Sequence[str] = option(
+        "Test to run; repeatable.",
+        ("length", "inputs", "precision", "openmm"),
+        choices=("length", "inputs", "precision", "openmm"),
+        words=("section",),
+    )
+    scene: str | None = option(
+        "Scene to test, for weights of several peptides, such as sequence:ACE-LEU-SER-NME.", None
+    )
+    quick: bool = option("Short runs: a minute or two.", False)
 
 
 # By the verb's name in Python.

@@ -121,7 +121,7 @@ def test_every_command_that_is_named_exists(repository: Path) -> None:
 
 def test_commands_are_found_at_all(repository: Path) -> None:
     named = {command for path in documents(repository) for command, _ in commands(text_of(path))}
-    assert {"surromd reference", "surromd rollout", "surromd compare", "surromd bench"} <= named
+    assert {"surromd reference", "surromd rollout", "surromd compare", "surromd bench", "surromd stress"} <= named
     assert sum(command.startswith("python docs/studies") for command in named) > 10
 
 

@@ -71,6 +71,19 @@ def test_an_unseen_molecule_rolls_at_the_lag_that_is_kept(folder: Path) -> None:
     assert "outside the training domain (--force): size: 3 amino acids" in run("info", str(out)).stdout
 
 
+def test_stress_takes_the_molecule_to_try(folder: Path) -> None:
+    common = ["stress", str(folder / "w.safetensors"), "-o", str(folder / "stress"), "--section", "openmm", "--quick"]
+    done = run(*common, "--scene", "sequence:ACE-SER-ALA-NME", "--json")
+    assert done.exit_code == 0, done.stderr
+    found = json.loads(done.stdout)
+    assert found["scene"] == "ACE-SER-ALA-NME" and list(found["sections"]) == ["openmm"]
+    first = json.loads(run(*common, "--json").stdout)
+    assert first["scene"] == "ACE-ALA-SER-NME"
+    for text, why in (("sequence:ACE-GLY-NME", "residues"), ("smiles:C((", "smiles")):
+        refused = run(*common, "--scene", text)
+        assert refused.exit_code == 1 and why in refused.stderr.lower() and refused.stderr.count("\n") == 1
+
+
 def test_other_architectures_and_further_training_take_neither(folder: Path) -> None:
     reference, out = str(folder / "ACE-SER-NME.h5"), str(folder / "x.safetensors")
     lags = ["--steps", "4", "--longest-lag", "10ps"]

@@ -1,44 +1,38 @@
-"""How weights stand long rollouts, odd inputs and other arithmetic, beside OpenMM itself, all by the same criteria:
-
-    python docs/studies/surrogates/stability.py WEIGHTS -o FOLDER [--quick] [--scene sequence:ACE-LEU-SER-NME]
-
-Odd inputs are those that a rollout was not made for: noisy, strained, mirrored, with other atoms. Tables stand in
-FOLDER/stability.md and .json, written anew after each section; rollouts stay there and are gone on with.
-"""
+"""The numerical-stability test of weights: long rollouts; inputs that a rollout was not made for (noisy, strained,
+mirrored, with other atoms); other arithmetic; and OpenMM, all by the same criteria."""
 
 from __future__ import annotations
 
-import argparse
 import json
-import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
 
 from surrogate.bench.timing import Roller, machine_facts, markdown_table, openmm_of
 from surrogate.comparison.measure.distributions import distance
-from surrogate.models.architecture import weights_path
-from surrogate.models.weights import Weights, load_weights
 from surrogate.sampling.chunks import ChunkSampler
 from surrogate.sampling.config import RolloutConfig
 from surrogate.sampling.domain import find_deviations, fit_weights, match_domain
 from systems.chemistry.geometry import torsion
 from systems.chemistry.graph import rotatable_torsions
 from systems.chemistry.validity import BOND_HALF_ANGSTROM, INVALID, NOT_FINITE, Geometry, check_frames
-from systems.errors import InputError, OutOfDomainError, SimulationError, SurromdError, first_line
+from systems.errors import InputError, OutOfDomainError, SimulationError, StorageError, SurromdError, first_line
 from systems.files.whole_file import create_whole
-from systems.library.named_scenes import prepare
 from systems.scene import FloatArray, IntArray, Scene, part_of
 from systems.trajectory.codec import open_trajectory
 
+if TYPE_CHECKING:
+    from surrogate.models.weights import Weights
+    from surrogate.verbs.options import StressOptions
+
 Frames = npt.NDArray[np.floating[Any]]
-ReportFn = Callable[[str], object]
+ReportFn = Callable[[str], None]
 # Sections of the test, and their titles.
 TITLES = {
     "length": "Long rollouts",
@@ -56,25 +50,43 @@ _TORSION_BINS = 36
 _STIFF_NM = 5e-4
 
 
-@dataclass(frozen=True)
-class StabilityOptions:
-    """What is run: rollouts of so many `frames` in all replicas together, under each guard, and which sections."""
+def stress(
+    weights: str | Path, folder: Path, options: StressOptions, *, report: ReportFn = lambda name: None
+) -> dict[str, Any]:
+    """Run a stress test of weights, by name or file, and write its tables into `folder`; return its rows.
 
-    frames: Sequence[int] = ()
-    replicas: int | None = None
-    guards: Sequence[str] = ("flag", "repair")
-    sections: Sequence[str] = tuple(TITLES)
-    quick: bool = False
-    seed: int = 0
+    Weights of several peptides are tried on `options.scene`, or the first that they were trained on. Raises
+    SurromdError for weights that cannot be loaded or do not cover the scene and a folder that cannot be written;
+    KeyboardInterrupt says what is kept.
+    """
+    from surrogate.models.architecture import weights_path
+    from surrogate.models.weights import load_weights
+
+    loaded = load_weights(weights_path(weights))
+    if options.scene is not None:
+        from systems.library.named_scenes import prepare
+
+        loaded, _ = fit_weights(prepare(options.scene), loaded)
+    elif loaded.domain.transferable:
+        loaded, _ = fit_weights(loaded.domain.scene, loaded)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise StorageError(f"cannot make the folder {folder} ({error.strerror}); name another with `out`.") from error
+    try:
+        return run_stress(loaded, folder, options, report=report)
+    except KeyboardInterrupt:
+        raise KeyboardInterrupt(f"{folder} keeps what was done; the same command goes on") from None
 
 
-def run_stability(
-    weights: Weights, folder: Path, options: StabilityOptions, *, report: ReportFn = lambda name: None
+def run_stress(
+    weights: Weights, folder: Path, options: StressOptions, *, report: ReportFn = lambda name: None
 ) -> dict[str, Any]:
     """Run the sections and return their rows, JSON-able; rollouts stay in `folder` and are resumed when run again.
     Weights are for one molecule (`sampling.domain.fit_weights`).
 
-    `report` is called with each section as it begins. Raises SurromdError where a rollout cannot be written.
+    stress.json and stress.md are written anew after each section. `report` is called with each section as it begins.
+    Raises SurromdError where a rollout cannot be written.
     """
     is_quick, seed = options.quick, options.seed
     frames = options.frames or ((1_000,) if is_quick else (10_000, 100_000))
@@ -105,14 +117,14 @@ def run_stability(
     for name in (name for name in TITLES if name in options.sections):
         report(name)
         result["sections"][name] = run[name]()
-        create_whole(folder / "stability.json", json.dumps(result, indent=1))
-        create_whole(folder / "stability.md", markdown(result))
+        create_whole(folder / "stress.json", json.dumps(result, indent=1))
+        create_whole(folder / "stress.md", markdown(result))
     return result
 
 
 def markdown(result: dict[str, Any]) -> str:
     """Return the tables."""
-    head = [f"# Stability of {result['weights']}", f"{result['domain']}; {result['model']}, {result['made']}"]
+    head = [f"# Stress test of {result['weights']}", f"{result['domain']}; {result['model']}, {result['made']}"]
     lines = [head[0], "", head[1], "", result["machine"]["about"], ""]
     for name, rows in result["sections"].items():
         lines += [f"## {TITLES[name]}", "", *markdown_table(rows), ""]
@@ -333,28 +345,3 @@ def measure_openmm(weights: Weights, *, n_frames: int, seed: int = 0) -> list[di
         row |= {"temperature_k": float(temperatures[half:].mean()), "potential_kj_mol": float(energies[half:].mean())}
         rows.append(row | speed)
     return rows
-
-
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("weights")
-    parser.add_argument("-o", "--out", type=Path, default=Path("stability"))
-    parser.add_argument("--scene")
-    parser.add_argument("--frames", type=int, nargs="+", default=())
-    parser.add_argument("--replicas", type=int)
-    parser.add_argument("--guards", nargs="+", default=("flag", "repair"))
-    parser.add_argument("--sections", nargs="+", choices=TITLES, default=tuple(TITLES))
-    parser.add_argument("--quick", action="store_true")
-    parser.add_argument("--seed", type=int, default=0)
-    args = parser.parse_args()
-    weights = load_weights(weights_path(args.weights))
-    if args.scene or weights.domain.transferable:
-        weights, _ = fit_weights(prepare(args.scene) if args.scene else weights.domain.scene, weights)
-    args.out.mkdir(parents=True, exist_ok=True)
-    options = StabilityOptions(args.frames, args.replicas, args.guards, args.sections, args.quick, args.seed)
-    result = run_stability(weights, args.out, options, report=lambda name: sys.stderr.write(f"{name}\n"))
-    sys.stdout.write(markdown(result))
-
-
-if __name__ == "__main__":
-    main()

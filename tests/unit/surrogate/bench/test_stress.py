@@ -1,4 +1,4 @@
-"""The stability study's own measures on frames whose faults are known, and the whole of it on tiny weights."""
+"""The stress test's own measures on frames whose faults are known, and the whole of it on tiny weights."""
 
 from __future__ import annotations
 
@@ -8,8 +8,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from stability import (
-    StabilityOptions,
+
+from md_reference.run.engine import Engine
+from surrogate.bench.stress import (
     markdown,
     measure_bonds,
     measure_drift,
@@ -17,12 +18,11 @@ from stability import (
     measure_openmm,
     measure_precision,
     measure_validity,
-    run_stability,
+    run_stress,
 )
-
-from md_reference.run.engine import Engine
 from surrogate.bench.timing import openmm_of
 from surrogate.models.weights import Weights
+from surrogate.verbs.options import StressOptions
 from systems.chemistry.validity import Geometry, geometry_from_frames
 from systems.errors import InputError
 from systems.scene import Scene
@@ -90,21 +90,21 @@ def test_arithmetic(small_weights: Weights) -> None:
     assert 1e-6 < half["rms_nm"] <= half["deviation_nm"], "bf16 must not be float32 by another name"
 
 
-def test_a_whole_study_writes_its_tables(tmp_path: Path, small_weights: Weights) -> None:
-    options = StabilityOptions(frames=[80], replicas=2, guards=["off"], sections=["length", "precision"], quick=True)
+def test_a_whole_stress_test_writes_its_tables(tmp_path: Path, small_weights: Weights) -> None:
+    options = StressOptions(frames=[80], replicas=2, guards=["off"], sections=["length", "precision"], quick=True)
     shown: list[str] = []
-    result = run_stability(small_weights, tmp_path, options, report=shown.append)
+    result = run_stress(small_weights, tmp_path, options, report=shown.append)
     assert shown == ["length", "precision"]
     (row,) = result["sections"]["length"]
     assert row["frames"] == 80 and 0.0 <= row["valid_half_angstrom_%"] <= 100.0
-    assert json.loads((tmp_path / "stability.json").read_text())["sections"]["length"][0]["frames"] == 80
-    text = (tmp_path / "stability.md").read_text()
+    assert json.loads((tmp_path / "stress.json").read_text())["sections"]["length"][0]["frames"] == 80
+    text = (tmp_path / "stress.md").read_text()
     assert "## Long rollouts" in text and "chunks helped" in text and text == markdown(result)
     other = replace(small_weights, hash="another")
-    (row,) = run_stability(other, tmp_path, replace(options, sections=["length"]))["sections"]["length"]
+    (row,) = run_stress(other, tmp_path, replace(options, sections=["length"]))["sections"]["length"]
     assert "complete, but of weights_hash" in row["outcome"], "rollouts of other weights are not taken for its own"
     with pytest.raises(InputError, match="ten frames"):
-        run_stability(small_weights, tmp_path, StabilityOptions(frames=[100], replicas=16))
+        run_stress(small_weights, tmp_path, StressOptions(frames=[100], replicas=16))
 
 
 @pytest.mark.parametrize("rigid", [True, False])
@@ -131,7 +131,7 @@ def test_openmm_moves_in_every_frame_under_the_constraints_of_the_reference(
         usual(engine, n_steps)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("stability.DISCARDED_PS", 0.05)
+        patch.setattr("surrogate.bench.stress.DISCARDED_PS", 0.05)
         patch.setattr(Engine, "step", step)
         assert measure_openmm(replace(small_weights, domain=domain), n_frames=4)[0]["timestep_fs"] == 1.0
     assert taken[:5] == [50, 1, 1, 1, 1] and min(taken) == 1
