@@ -82,14 +82,13 @@ class Setting:
     steps: int
     precision: str = "auto"
     batch: int = 32
-    compile: bool = False
 
     @property
     def label(self) -> str:
         words = [f"{self.solver} {self.steps}" if self.solver else "as it is"]
         words += [self.precision] if self.precision != "auto" else []
         words += [f"batch {self.batch}"] if self.batch != Setting.batch else []
-        return ", ".join(words + (["compiled"] if self.compile else []))
+        return ", ".join(words)
 
 
 def cost_error(
@@ -123,8 +122,7 @@ def choose_settings(weights: Weights, sweep: Sweep) -> list[Setting]:
         raise InputError(f"{weights.path.name} knows no solver {unknown[0]!r}; choose {', '.join(known) or 'none'}.")
     solvers: list[str | None] = [*(sweep.solvers or [name for name in known if name not in ADAPTIVE])] or [None]
     steps = sweep.steps if known else (weights.model.usual_steps,)
-    compiled = (False, True) if sweep.compiled else (False,)
-    return [Setting(*each) for each in product(solvers, steps, sweep.precisions, sweep.batches, compiled)]
+    return [Setting(*each) for each in product(solvers, steps, sweep.precisions, sweep.batches)]
 
 
 def run_cost_error(
@@ -192,8 +190,7 @@ def measure_setting(
     named = {"weights": weights.path.stem, "weights_hash": weights.hash, "label": setting.label}
     row: dict[str, Any] = named | asdict(setting)
     try:
-        sampler = ChunkSampler(weights, solver=setting.solver, solver_steps=setting.steps, precision=setting.precision,
-                               compile=setting.compile)  # fmt: skip
+        sampler = ChunkSampler(weights, solver=setting.solver, solver_steps=setting.steps, precision=setting.precision)
         roller = Roller(weights, sampler, rows=setting.batch, seed=config.seed)
         discarded = -(-config.discarded_ps // (sampler.n_new * weights.domain.lag_ps))
         started = time.process_time()

@@ -100,7 +100,7 @@ def run_stress(
             for n in frames
         ],
         "inputs": lambda: measure_odd_inputs(weights, chunks=2 if is_quick else 4, seed=seed),
-        "precision": lambda: measure_precision(weights, compiled=not is_quick, seed=seed),
+        "precision": lambda: measure_precision(weights, seed=seed),
         "openmm": lambda: measure_openmm(weights, n_frames=20 if is_quick else 200, seed=seed),
     }
     result: dict[str, Any] = {
@@ -288,18 +288,16 @@ def measure_odd_inputs(weights: Weights, *, chunks: int = 4, seed: int = 0) -> l
     return rows
 
 
-def measure_precision(weights: Weights, *, compiled: bool, seed: int = 0) -> list[dict[str, Any]]:
+def measure_precision(weights: Weights, *, seed: int = 0) -> list[dict[str, Any]]:
     """Return of each arithmetic how far the first chunk of eight replicas is from float32's: the greatest coordinate
     and the root mean square, nm; validity is that of this one chunk."""
     geometry = Geometry.from_dict(weights.domain.geometry)
     reference: Frames | None = None
     rows: list[dict[str, Any]] = []
-    for name in ("fp32", "bf16", *(["fp32, compiled"] if compiled else [])):
+    for name in ("fp32", "bf16"):
         try:
-            sampler = ChunkSampler(weights, precision=name[:4], compile="compiled" in name)
-            Roller(weights, sampler, rows=_ROWS, seed=seed).advance(
-                sampler.n_new
-            )  # what is compiled or cached at first
+            sampler = ChunkSampler(weights, precision=name)
+            Roller(weights, sampler, rows=_ROWS, seed=seed).advance(sampler.n_new)  # what is cached at first
             started = time.process_time()
             frames = Roller(weights, sampler, rows=_ROWS, seed=seed).advance(sampler.n_new)
         except (SurromdError, RuntimeError, OSError, ImportError) as error:

@@ -5,16 +5,11 @@ from __future__ import annotations
 
 import copy
 import math
-import os
-import shutil
 from typing import TypeVar, cast
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
-
-from surrogate.models.potential import Potential
-from systems.errors import InputError
 
 # Keys and values of a block, each (rows, heads, length, head_dim).
 KeysValues = tuple[Tensor, Tensor]
@@ -319,26 +314,3 @@ class LeanCrossBlock(nn.Module):
 class _Gelu(nn.Module):
     def forward(self, x: Tensor) -> Tensor:
         return gelu(x)
-
-
-def with_compiled_parts(model: _Model) -> _Model:
-    """Return a copy whose networks are compiled by torch when they are first called, for arrays of one shape; parts
-    that are not called as a network, such as encoder and decoder, are the lean ones.
-
-    Weights become constants of what is compiled (freezing): for a single replica an evaluation takes a quarter to a
-    half less time. Raises InputError where there is no C++ compiler.
-    """
-    if not any(shutil.which(name) for name in (os.environ.get("CXX") or "g++", "clang++")):
-        raise InputError("compiling needs a C++ compiler (g++ or clang++), which is not on the PATH; leave it out.")
-    copied = copy.deepcopy(model)
-    if isinstance(copied, Potential):
-        return copied  # what it integrates is compiled as it is
-    lists = [child for child in copied.children() if isinstance(child, nn.ModuleList)]
-    parents: list[nn.Module] = [copied, *lists]
-    for parent in parents:
-        for name, child in list(parent.named_children()):
-            if type(child).forward is nn.Module.forward and child not in lists:  # it has none
-                setattr(parent, name, with_lean_parts(child))
-            elif child not in lists:
-                setattr(parent, name, torch.compile(child, dynamic=False, options={"freezing": True}))
-    return copied

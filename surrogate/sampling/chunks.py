@@ -26,7 +26,7 @@ import numpy.typing as npt
 import torch
 
 from surrogate.data import fitted_atoms
-from surrogate.models.layers import with_compiled_parts, with_lean_parts
+from surrogate.models.layers import with_lean_parts
 from surrogate.models.potential import Potential
 from surrogate.models.propagator import Propagator, draw_noise
 from surrogate.sampling.config import RolloutConfig
@@ -58,15 +58,13 @@ class ChunkSampler:
     """One model, ready to draw chunks: what a rollout does with the weights, and all that it does with them.
 
     Atoms are in the model's order throughout. `batch` is the most replicas computed at once: None for all, until
-    memory runs out, and then half as many, for good. `compile`: the networks are compiled for the first batch drawn;
-    others, such as a single chunk drawn again, go through the plain ones. Raises InputError for a solver or
-    precision that does not suit the weights, and where there is nothing to compile with.
+    memory runs out, and then half as many, for good. Raises InputError for a solver or precision that does not suit
+    the weights.
     """
 
     def __init__(
-        self, weights: Weights, *, solver_steps: int | None = None, solver: str | None = None, precision: str = "auto",
-        compile: bool = False,
-    ) -> None:  # fmt: skip
+        self, weights: Weights, *, solver_steps: int | None = None, solver: str | None = None, precision: str = "auto"
+    ) -> None:
         model, template = weights.model, weights.domain.scene
         keep_freed_memory()
         known = model.solvers
@@ -81,10 +79,7 @@ class ChunkSampler:
         self.batch: int | None = None
         # Chunks drawn, each row one, and the network evaluations they took together.
         self.drawn, self.evaluations = 0, 0.0
-        plain = with_bf16_weights(model) if self.precision.bf16 else model
-        self._model = with_lean_parts(plain)
-        self._compiled = with_compiled_parts(plain) if compile else None
-        self._compiled_rows: int | None = None
+        self._model = with_lean_parts(with_bf16_weights(model) if self.precision.bf16 else model)
         self._molecule = model.featurise(template)
         self._fit = fitted_atoms(template)
         self._target = template.positions_nm - template.positions_nm[self._fit].mean(axis=0)
@@ -134,7 +129,6 @@ class ChunkSampler:
                             "memory does not suffice for one replica; use smaller weights."
                         ) from error
                     self.batch = -(-size // 2)
-                    self._compiled_rows = None
                     continue
                 start += size
         order = np.argsort(np.concatenate([rows for rows, _ in parts]))
@@ -155,12 +149,8 @@ class ChunkSampler:
         canonical = np.einsum("rij,rtnj->rtni", rotation, last) + translation[:, None, None, :]
         noise = draw_noise(self._model, n_atoms, [torch.Generator().manual_seed(seed) for seed in seeds])
         turned = None if velocities is None else np.einsum("rij,rnj->rni", rotation, velocities)
-        model = self._model
-        if self._compiled is not None:
-            self._compiled_rows = self._compiled_rows or len(seeds)
-            model = self._compiled if len(seeds) == self._compiled_rows else model
         with torch.autocast("cpu", dtype=torch.bfloat16, enabled=self.precision.bf16):
-            chunk = model.next_chunk(
+            chunk = self._model.next_chunk(
                 torch.from_numpy(canonical.astype(np.float32)), self._molecule, noise, solver_steps=self.solver_steps,
                 solver=self.solver,
                 last_velocities_nm_ps=None if turned is None else torch.from_numpy(turned.astype(np.float32)),

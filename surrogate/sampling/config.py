@@ -71,9 +71,6 @@ class RolloutConfig:
     precision: str = option(
         "Floating-point precision of the network.", "auto", choices=("auto", "fp32", "bf16"), section="sampling"
     )
-    compile: bool = option(
-        "Compile the network with torch.compile; takes a minute and a C++ compiler.", False, section="sampling"
-    )
     seed: int = option("Random seed.", 0, within=(0, None))
 
     def __post_init__(self) -> None:

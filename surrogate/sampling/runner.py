@@ -352,9 +352,7 @@ def rollout(
     if resume and precision == "auto" and state_path.exists():
         # A rollout that goes on keeps it, whatever another processor would choose.
         precision = "bf16" if checkpoint.read_checkpoint(state_path)[0]["settings"]["bf16"] else "fp32"
-    sampler = ChunkSampler(
-        weights, solver_steps=config.solver_steps, solver=config.solver, precision=precision, compile=config.compile
-    )
+    sampler = ChunkSampler(weights, solver_steps=config.solver_steps, solver=config.solver, precision=precision)
     plan = resolve_plan(scene, weights, match, config, sampler, n_replicas=len(outs))
     check_disk(outs[0], plan.n_frames * len(outs), len(plan.kept_atoms))
 

@@ -232,7 +232,6 @@ class Sweep:
         "Precision to try; repeatable.", ("auto",), choices=("auto", "fp32", "bf16"), words=("precision",)
     )
     batches: Sequence[int] = option("Number of replicas to try; repeatable.", (32,), within=(1, None), words=("batch",))
-    compiled: bool = option("Also time the compiled network.", False, words=("compile",))
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -160,8 +160,7 @@ def rollout(
     `lag_ps`, by default at the longest that `save_every_ps` is a multiple of; weights of several peptides take others
     of the same residues. Replicas run in one batch, are named as by `reference` and joined as there. `solver`:
     'multistep', 'fitted' (for few `solver_steps`, 2 to 10), 'euler' or the adaptive 'dopri5', None for the one that
-    suits the weights. `precision`: 'fp32', 'bf16' or 'auto'. `compile`: the networks, by torch; it takes a C++ compiler
-    and about a minute, and pays in long rollouts.
+    suits the weights. `precision`: 'fp32', 'bf16' or 'auto'.
 
     Every frame is checked as it is made against what the training reference does. `guard` says what is done about one
     that fails: 'flag' marks it, 'resample' draws the chunk again, 'repair' relaxes it with OpenMM, 'fallback' runs real

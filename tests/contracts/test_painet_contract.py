@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import partial
 
 import pytest
 import torch
 
 from known_answers import largest_step, pair_energy
-from surrogate.models import layers
 from surrogate.models.conformance import PropagatorContract, branched_chain, random_state
 from surrogate.models.painet.model import (
     BOND,
@@ -54,16 +52,6 @@ class TestPainetDense(TestPainet):
 class TestEgnnAlone(TestPainet):
     def make(self, n_atoms: int) -> Propagator:
         return lively(SMALL, EgnnForecaster)
-
-
-def test_a_compiled_model_answers_alike(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(layers.torch, "compile", partial(torch.compile, backend="eager"))
-    contract = TestPainet()
-    model, frames, molecule, noise, velocities = contract.given()
-    plain, compiled = (
-        contract.call(m, frames, molecule, noise, velocities) for m in (model, layers.with_compiled_parts(model))
-    )
-    torch.testing.assert_close(compiled.frames_nm, plain.frames_nm, rtol=0, atol=1e-6)
 
 
 def test_the_factored_attention_equals_the_dense_one() -> None:

@@ -93,7 +93,6 @@ def main() -> None:
     parser.add_argument("--lag", type=float, default=10.0)
     parser.add_argument("--batch", type=int, default=64)
     parser.add_argument("--ns", type=float, default=640.0)
-    parser.add_argument("--compile", action="store_true")
     parser.add_argument("--json", type=Path, default=None)
     args = parser.parse_args()
     torch.set_num_threads(1)
@@ -110,9 +109,9 @@ def main() -> None:
     config = CostErrorConfig(time_ps=1e3 * args.ns)
     for name in args.settings:
         solver, steps = name.split(":")
-        sampler = ChunkSampler(fitted, solver=solver, solver_steps=int(steps), compile=args.compile)
+        sampler = ChunkSampler(fitted, solver=solver, solver_steps=int(steps))
         roller = Roller(fitted, sampler, rows=args.batch, seed=0)
-        roller.advance(sampler.n_new)  # settles, and compiles
+        roller.advance(sampler.n_new)  # settles
         parts, cost = roll_in_turns(fitted, roller, sampler, config)
         frames = np.concatenate(parts, axis=1)
         row = told(list(torsions(fitted.domain.scene, frames)), args.lag, reference)

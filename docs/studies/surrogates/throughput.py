@@ -5,9 +5,7 @@
 operations of matrix products (torch's flop counter), over time, over that peak. Last it samples 30 frames (10 of them
 given) x 32 latents x width 128 x 6 layers in 10 Euler steps (Table 11), by turns with the plain float32 program of
 `bench.plain_network`, which computes the same function; ratios are the median, least and greatest over rounds.
-With `--compile` (needs a C++ compiler) also compiled by torch, as `rollout` runs it with `compile`; what
-compiling takes is left out. Processor time of all threads over their number, so that a shared machine does not count
-twice.
+Processor time of all threads over their number, so that a shared machine does not count twice.
 """
 
 from __future__ import annotations
@@ -125,10 +123,9 @@ def sampling_rate(model: LamSlide, molecule: Molecule, precision: str, peak: flo
     return measure("sampling, frames", precision, batch * model.n_new, peak, draw, repeats)
 
 
-def sampling_ratio(batch: int, rounds: int, *, compiled: bool = False) -> dict[str, Any]:
+def sampling_ratio(batch: int, rounds: int) -> dict[str, Any]:
     """Time 10 Euler steps of the paper's network by turns: the plain float32 program, ours in float32, in bf16, and in
-    bf16 with conditioning frames computed once, each of the last two also `compiled`; `relative_error` is that of a
-    single evaluation."""
+    bf16 with conditioning frames computed once; `relative_error` is that of a single evaluation."""
     torch.manual_seed(0)
     exact = Approximator(PAPER, PAPER_LATENTS, PAPER_DIM).eval().requires_grad_(False)
     filled(exact)
@@ -149,10 +146,6 @@ def sampling_ratio(batch: int, rounds: int, *, compiled: bool = False) -> dict[s
         "ours bf16": (True, lambda: lambda o, tau: rough(o, tau, known)),
         "ours bf16, clean": (True, lambda: with_memory(once)),
     }
-    if compiled:
-        fast, fast_once = torch.compile(rough), torch.compile(once)
-        ways["ours bf16, compiled"] = (True, lambda: lambda o, tau: fast(o, tau, known))
-        ways["ours bf16, clean, compiled"] = (True, lambda: with_memory(fast_once))
 
     def sample(name: str, n_steps: int = PAPER_STEPS) -> Tensor:
         bf16, network = ways[name]
@@ -182,7 +175,6 @@ def main() -> None:
     parser.add_argument("--repeats", type=int, default=5, help="of each training and sampling call; 0 leaves them out")
     parser.add_argument("--rounds", type=int, default=5, help="of the paper's network beside the plain program")
     parser.add_argument("--paper-batches", type=int, nargs="*", default=[1, 4])
-    parser.add_argument("--compile", action="store_true", help="also compiled (minutes, and a C++ compiler)")
     parser.add_argument("--json", type=Path, default=None)
     args = parser.parse_args()
     if args.threads is not None:
@@ -203,7 +195,7 @@ def main() -> None:
                 f"{r.what:18} {r.precision}: {r.per_second:9.1f} a second, {r.gflops:6.1f} GFLOP/s, "
                 f"{100 * r.share:.1f} % of the peak\n"
             )
-    sampled = [sampling_ratio(batch, args.rounds, compiled=args.compile) for batch in args.paper_batches]
+    sampled = [sampling_ratio(batch, args.rounds) for batch in args.paper_batches]
     for found in sampled:
         for name in [key for key in found if key != "batch"]:
             row = found[name]

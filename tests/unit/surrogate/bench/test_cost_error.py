@@ -166,12 +166,12 @@ def test_frames_further_apart_than_the_weights_step_are_compared_and_what_differ
 def test_settings_are_combinations_of_what_is_asked(weights: Weights) -> None:
     usual = choose_settings(weights, Sweep())
     assert Setting("fitted", 4) in usual and len(set(usual)) == len(usual)
-    assert not any(s.solver == "dopri5" or s.compile for s in usual)
-    sweep = Sweep(solvers=["dopri5"], steps=[2], precisions=["fp32"], batches=[1, 4], compiled=True)
+    assert not any(s.solver == "dopri5" for s in usual)
+    sweep = Sweep(solvers=["dopri5"], steps=[2], precisions=["fp32"], batches=[1, 4])
     assert [s.label for s in choose_settings(weights, sweep)] == [
-        "dopri5 2, fp32, batch 1", "dopri5 2, fp32, batch 1, compiled",
-        "dopri5 2, fp32, batch 4", "dopri5 2, fp32, batch 4, compiled",
-    ]  # fmt: skip
+        "dopri5 2, fp32, batch 1",
+        "dopri5 2, fp32, batch 4",
+    ]
     with pytest.raises(InputError, match="knows no solver 'rk4'"):
         choose_settings(weights, Sweep(solvers=["rk4"]))
 

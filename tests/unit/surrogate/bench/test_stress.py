@@ -85,7 +85,7 @@ def test_odd_inputs_are_refused_with_their_reason(small_weights: Weights) -> Non
 
 
 def test_arithmetic(small_weights: Weights) -> None:
-    single, half = measure_precision(small_weights, compiled=False)
+    single, half = measure_precision(small_weights)
     assert single["deviation_nm"] == 0.0 and half["arithmetic"] == "bf16"
     assert 1e-6 < half["rms_nm"] <= half["deviation_nm"], "bf16 must not be float32 by another name"
 

@@ -46,7 +46,7 @@ def test_file_says_what_it_is(tmp_path: Path, small_weights: Weights, alanine_di
     assert not (tmp_path / "a.h5.checkpoint").exists()
     said = record | record["interventions"] | {"time_ps": 40.0, "atoms": "all", "select": None}
     assert said.keys() >= options_of(RolloutConfig).keys()
-    assert (said["guard"], said["seed"], said["solver_steps"], said["compile"]) == ("off", 0, 2, False)
+    assert (said["guard"], said["seed"], said["solver_steps"]) == ("off", 0, 2)
     assert not {"guard", "atoms", "select", "time_ps"} & record.keys()
 
 
