@@ -24,7 +24,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from surrogate.bench.timing import (
-    OPENMM,
     SIMD,
     Frames,
     Roller,
@@ -69,9 +68,6 @@ CHECKS = {
 }
 # Below so many effective samples of MD, nobody knows its relaxation time.
 LEAST_SAMPLES = 50.0
-# A rollout with fewer whole molecules is drawn hollow: its error does not count.
-SOUND_PERCENT = 99.0
-_COLOURS = {"multistep": "#1f77b4", "fitted": "#d62728", "euler": "#7f7f7f", "dopri5": "#9467bd"}
 
 
 @dataclass(frozen=True)
@@ -134,7 +130,7 @@ def run_cost_error(
     *,
     report: ReportFn = lambda line: None,
 ) -> dict[str, Any]:
-    """Measure weights at their settings and write cost_error.json, .md and .svg into `folder` after each.
+    """Measure weights at their settings and write cost_error.json and .md into `folder` after each.
 
     What an earlier run left there is kept, if it was of the same references and the same `config`. Raises InputError
     for references that weights were trained on, for a folder of another benchmark, and for weights of other molecules;
@@ -422,11 +418,9 @@ def _sources(provenance: dict[str, Any]) -> Iterator[dict[str, Any]]:
 
 
 def write_cost_error(result: dict[str, Any], folder: Path) -> None:
-    """Write cost_error.json, .md and, where a setting was measured, .svg. Raises StorageError."""
+    """Write cost_error.json and .md. Raises StorageError."""
     create_whole(folder / "cost_error.json", json.dumps(result, indent=1))
     create_whole(folder / "cost_error.md", markdown(result))
-    if any("jsd" in row for row in result["rows"]):
-        create_whole(folder / "cost_error.svg", lambda path: plot(result, path))
 
 
 def markdown(result: dict[str, Any]) -> str:
@@ -518,42 +512,3 @@ def _interval(found: Sequence[float | None], digits: str) -> str:
     """Return a value with the ends of its interval, such as '0.31 [0.28, 0.35]'; without them where none is known."""
     value, *ends = ("..." if each is None else f"{each:{digits}}" for each in found)
     return f"{value} [{', '.join(ends)}]" if found[1:] != [None, None] else value
-
-
-def plot(result: dict[str, Any], path: Path) -> None:
-    """Draw error against processor seconds, logarithmic: MD of every length, and each setting."""
-    from matplotlib.figure import Figure
-    from matplotlib.ticker import FixedLocator, ScalarFormatter
-
-    figure = Figure(figsize=(8.2, 5.4), layout="constrained")
-    axes = figure.add_subplot()
-    md = result["md"]
-    cost = next(cost for cost in md["cost"] if cost["way"] == OPENMM)
-    x = 1e-3 * np.asarray(md["lengths_ps"]) * cost["cpu_s_per_ns"]["mean"]
-    axes.plot(x, md["errors"], color="black", lw=1.4, label=cost["label"])
-    axes.fill_between(x, md["errors_low"], md["errors_high"], color="black", alpha=0.1, lw=0)
-    axes.axhline(md["replicate_baseline"], color="black", lw=0.8, alpha=0.5)
-    text = f"two runs of {1e-3 * md['length_ps']:g} ns"
-    axes.annotate(text, (0.01, md["replicate_baseline"]), xycoords=("axes fraction", "data"), va="bottom", fontsize=8)
-    labelled = set()
-    for row in (row for row in result["rows"] if "jsd" in row):
-        colour = _COLOURS.get(row["solver"], "#2ca02c")
-        is_sound = row["valid_half_angstrom_%"]["value"] >= SOUND_PERCENT
-        at = row["spent_s"], row["jsd"]["value"]
-        low, high = (at[1] if row["jsd"][end] is None else row["jsd"][end] for end in ("low", "high"))
-        bar = [[max(at[1] - max(low, 0.5 * at[1]), 0.0)], [max(high - at[1], 0.0)]]
-        axes.errorbar(*at, bar, fmt="o", color=colour, lw=0.7, mfc=colour if is_sound else "white", zorder=3,
-                      label=None if row["solver"] in labelled else row["solver"] or "surrogate")  # fmt: skip
-        labelled.add(row["solver"])
-        axes.annotate(row["label"].removeprefix(f"{row['solver']} "), at, xytext=(5, 3), textcoords="offset points",
-                      fontsize=7.5, color=colour)  # fmt: skip
-    axes.set(xscale="log", yscale="log", xlabel="processor time / s (one core)",
-             ylabel="Jensen-Shannon distance of the φ/ψ map to held-out MD",
-             title=f"{result['scene']}: run time against error")  # fmt: skip
-    axes.yaxis.set_major_locator(FixedLocator([0.02, 0.03, 0.05, 0.07, 0.1, 0.15, 0.2, 0.3, 0.4, 0.5, 0.6, 0.8]))
-    axes.yaxis.set_major_formatter(ScalarFormatter())
-    axes.yaxis.set_minor_locator(FixedLocator([]))
-    axes.grid(alpha=0.25, which="major")
-    axes.plot([], [], "o", color="grey", mfc="white", label=f"under {SOUND_PERCENT:g} % of frames whole")
-    axes.legend(frameon=False, fontsize=8.5, title="numbers: solver steps", title_fontsize=8)
-    figure.savefig(path, format="svg", dpi=140)

@@ -473,7 +473,7 @@ def cost_error(
 
     _measure(
         lambda report: bench.cost_error(reference, replicate, weights, out, options, report=report),
-        bench.markdown, f"{out}: cost_error.json, .md and .svg", as_json, options.quiet,
+        bench.markdown, f"{out}: cost_error.json and .md", as_json, options.quiet,
     )  # fmt: skip
 
 

@@ -21,7 +21,7 @@ from surrogate.comparison.read.ensemble import Ensemble, alike
 from surrogate.comparison.rows.charts import Chart, jsonable
 from surrogate.comparison.rows.rows import ComparisonInput, Options, Row, Sample, by_group, make_sample
 from surrogate.comparison.rows.torsion_rows import FEW_RESIDUES
-from surrogate.comparison.rows.validity_rows import CHECKS, EnergyFn, copied_from, measure_energies, unchecked
+from surrogate.comparison.rows.validity_rows import CHECKS, copied_from, unchecked
 from systems.chemistry import validity
 from systems.chemistry.element_data import covalent_radius_nm
 from systems.chemistry.validity import Geometry
@@ -186,7 +186,6 @@ def compare(
     scene: Scene | None = None,
     *,
     options: Options | None = None,
-    energy_fn: EnergyFn | None = None,
 ) -> Comparison:
     """Evaluate each candidate against the reference, beside a replicate of equal length.
 
@@ -194,9 +193,7 @@ def compare(
     `Ensemble.kept`: then all are compared on the atoms that they share. Without a replicate the
     reference is cut in two halves, the second serving as the replicate of the first. Each candidate is evaluated by
     itself, at the longest length that it shares with reference and replicate: adding a candidate changes no other's
-    numbers. `energy_fn(positions_nm)` gives the potential energy in kJ/mol of one frame of the reference's atoms; every
-    k-th frame is then evaluated by it, where no atoms are missing. Raises InputError when there is no candidate, atoms
-    differ, or too few frames are left.
+    numbers. Raises InputError when there is no candidate, atoms differ, or too few frames are left.
     """
     if not candidates:
         raise InputError("Nothing to compare with the reference: give at least one trajectory.")
@@ -215,10 +212,6 @@ def compare(
         _topology_note(ensemble, stage, refuse=True)
     baseline = Baseline.of(ref, parent=whole, kept=kept)
     measured = [baseline.measure(e) for e in thinned]
-    if energy_fn is not None and kept is None:
-        measured = [
-            replace(m, energy_kj=measure_energies(e, energy_fn)) for m, e in zip(measured, thinned, strict=True)
-        ]
     notes = [note for e in thinned for note in e.notes]
     notes += [note for e in rolled if (note := _topology_note(e, stage, refuse=False))]
     notes += [note for features in measured for note in _jump_notes(features)]

@@ -29,7 +29,6 @@ METRICS: tuple[Metric, ...] = (
     Metric("Bond lengths", "distribution", "fast", structure_rows.bond_rows),
     Metric("Bond angles", "distribution", "fast", structure_rows.angle_rows),
     Metric("Temperature of vibrations", "distribution", "fast", structure_rows.temperature_rows),
-    Metric("Potential energies", "distribution", "fast", validity_rows.energy_rows),
     Metric("Populations of basins", "distribution", "slow", torsion_rows.population_rows),
     Metric("φ and ψ", "distribution", "slow", torsion_rows.torsion_rows),
     Metric("Other torsions", "distribution", "slow", torsion_rows.other_torsion_rows),

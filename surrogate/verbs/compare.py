@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,11 +15,7 @@ from systems.errors import InputError
 from systems.options import options_as_keywords
 
 if TYPE_CHECKING:
-    import numpy as np
-    import numpy.typing as npt
-
     from surrogate.comparison.comparison import Comparison
-    from systems.scene import Scene
 
 
 @options_as_keywords(CompareOptions)
@@ -38,8 +33,7 @@ def compare(
     a single path for
     `candidates` is one candidate, and a sequence holds one each. `top`: topology for files that carry none. `dt_ps`:
     the time between frames, where the files do not say or say it wrongly. Of both, one stands for all, or there is one
-    for the reference, each candidate and the replicate in this order, None where the file says it itself. `energies`:
-    evaluate the potential energy of every k-th frame too, by the force field that the reference's file names. A report
+    for the reference, each candidate and the replicate in this order, None where the file says it itself. A report
     that is there stays unless `overwrite`. Raises InputError, TrajectoryError, OutOfDomainError.
     """
     from surrogate.comparison.comparison import compare as evaluate
@@ -69,8 +63,7 @@ def compare(
     if options.replicate is not None:
         files = find_trajectories(options.replicate)
         replicate = load_ensemble(files, template=ref.scene, top=tops[-1], lag_ps=lags[-1])
-    energy_fn = _relaxed_energy(ref.scene, ref.record) if options.energies else None
-    result = evaluate(ref, others, replicate, ref.scene, energy_fn=energy_fn)
+    result = evaluate(ref, others, replicate, ref.scene)
     if out_html is not None:
         from surrogate.comparison.report.report import write_report
 
@@ -91,27 +84,6 @@ def _one_each(name: str, given: Any, n: int) -> list[Any]:
             "candidate and the replicate, in this order."
         )
     return values
-
-
-def _relaxed_energy(scene: Scene, record: dict[str, Any]) -> Callable[[npt.NDArray[np.float64]], float]:
-    """Return what gives the energy in kJ/mol of a frame with its stiff bonds at rest, infinity where there is none."""
-    from md_reference.forces.forcefield import build_system, resolve
-    from md_reference.forces.spec import ForceFieldSpec
-    from md_reference.run.engine import Relaxer
-    from systems.errors import SimulationError
-
-    if record.get("force_field") is None or record.get("solvent") is None:
-        raise InputError("`energies`: the reference's file does not say with which force field it was made.")
-    spec = resolve(scene, ForceFieldSpec.of(record))
-    relaxer = Relaxer(scene, build_system(scene, spec), born=spec.is_born)
-
-    def energy(positions_nm: npt.NDArray[np.float64]) -> float:
-        try:
-            return relaxer.relax(positions_nm).potential_kj_mol
-        except SimulationError:
-            return math.inf
-
-    return energy
 
 
 @options_as_keywords(DemoOptions)

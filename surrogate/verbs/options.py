@@ -153,7 +153,6 @@ class CompareOptions(Overwriting):
         read=lambda text, what: None if text == "-" else parse_time_ps(text, what),
     )
     labels: str | Sequence[str] | None = option("Names of the candidates in the report.", None, words=None)
-    energies: bool = option("Also compare potential energies, by the reference's force field.", False)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -267,14 +267,12 @@ def test_replicas_are_numbered_and_differ(here: Path) -> None:
 
 
 def test_compare_writes_its_three_reports(here: Path, tmp_path_factory: pytest.TempPathFactory) -> None:
-    from systems.trajectory.codec import open_trajectory
-
     made = tmp_path_factory.mktemp("compare")
     assert (
         run("reference", "alanine-dipeptide", "--time", "20ps", "--save-every", "40fs", "--replicas", "2",
             "-o", str(made / "x.h5"), "--quiet").exit_code == 0
     )  # fmt: skip
-    result = run("compare", str(made / "x_r0.h5"), str(made / "x_r1.h5"), "-o", "report.html", "--energies")
+    result = run("compare", str(made / "x_r0.h5"), str(made / "x_r1.h5"), "-o", "report.html")
     assert result.exit_code == 0, result.stderr
     assert {p.name for p in here.iterdir()} == {"report.html", "report.json", "report.md"}
     assert "report.html" in result.stdout
@@ -287,12 +285,6 @@ def test_compare_writes_its_three_reports(here: Path, tmp_path_factory: pytest.T
         assert (here / name).read_bytes() == before
         for away in here.glob("*.away"):
             away.rename(here / away.stem)
-    rows = {row["key"]: row for row in json.loads((here / "report.json").read_text())["evaluations"][0]["rows"]}
-    # Stiff bonds at rest: below what the run itself recorded, by less than half of kT for each degree of freedom.
-    with open_trajectory(made / "x_r0.h5") as reader:
-        recorded = float(reader.scalars["potential_kj_mol"].mean())
-    relaxed = rows["energy_mean"]["reference"]["value"]
-    assert recorded - 60.0 < relaxed < recorded - 10.0, (recorded, relaxed)
     page = (here / "report.html").read_text()
     assert "http://" not in page.replace("http://www.w3.org", "") and "https://" not in page.replace(
         "https://doi.org", ""

@@ -429,7 +429,7 @@ class Features(InSegments):
     """Per-frame measurements of one ensemble, one array per segment.
 
     `phi` `(n, n_phi)` and `psi` `(n, n_psi)` rad, `bonds_nm` `(n, n_bonds)`, `flags` `(n,)`; all NaN-carrying where a
-    frame is not finite. `chunk_idx` `(n,)` or None; `energy_kj` `(n,)` kJ/mol, NaN where none was computed, or None;
+    frame is not finite. `chunk_idx` `(n,)` or None;
     `moved_nm` `(n,)` how far atoms are, root mean square, from where they were in the frame before
     (NaN for the first), centres of both laid together, or None; `grid_nm` what coordinates were rounded to, 0 for
     nothing. `series` holds the families `(n, k)` of `probes`, both or neither.
@@ -444,7 +444,6 @@ class Features(InSegments):
     chunk_idx: Sequence[npt.NDArray[np.int32]] | None
     series: Mapping[Family, Sequence[npt.NDArray[Any]]] = field(default_factory=dict)
     probes: Probes | None = None
-    energy_kj: Sequence[FloatArray] | None = None
     moved_nm: Sequence[Series] | None = None
     grid_nm: float = 0.0
 
@@ -468,7 +467,7 @@ class Features(InSegments):
         def cut(series: Sequence[npt.NDArray[Any]]) -> list[npt.NDArray[Any]]:
             return [s[a:b] for s, (a, b) in zip(series, spans, strict=True) if b > a]
 
-        names = ("phi", "psi", "bonds_nm", "flags", "chunk_idx", "energy_kj", "moved_nm")
+        names = ("phi", "psi", "bonds_nm", "flags", "chunk_idx", "moved_nm")
         parts: dict[str, Any] = {name: cut(getattr(self, name)) for name in names if getattr(self, name) is not None}
         return replace(self, **parts, series={family: cut(values) for family, values in self.series.items()})
 

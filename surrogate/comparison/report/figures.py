@@ -71,7 +71,6 @@ _TITLES: dict[Section, str] = {
     "distributions": "Distributions",
     "kinetics": "How fast things move",
     "structure": "Structure",
-    "validity": "Energies",
 }
 
 

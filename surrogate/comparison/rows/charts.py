@@ -12,7 +12,7 @@ import numpy as np
 
 from surrogate.comparison.measure.statistics import Estimate, FloatArray
 
-Section = Literal["structure", "distributions", "kinetics", "validity", "equivalent_time"]
+Section = Literal["structure", "distributions", "kinetics", "equivalent_time"]
 Role = Literal["reference", "candidate", "replicate", "other"]
 ROLES: tuple[Role, Role, Role] = ("reference", "candidate", "replicate")
 

@@ -16,9 +16,9 @@ import numpy as np
 
 from surrogate.comparison.measure import distributions, kinetics
 from surrogate.comparison.measure.slow_motion import tica_features
-from surrogate.comparison.measure.statistics import Blocks, Estimate, FloatArray, Segments
+from surrogate.comparison.measure.statistics import Estimate, FloatArray, Segments
 from surrogate.comparison.measure.structure import Features
-from surrogate.comparison.rows.charts import ROLES, Line, LineChart, bar_chart
+from surrogate.comparison.rows.charts import bar_chart
 from surrogate.comparison.rows.rows import ComparisonInput, Measured, left_out
 from systems.units import format_time_ps
 
@@ -90,28 +90,8 @@ def peptide_table(fit: Fit, reference: Features, other: Features) -> FloatArray:
     return np.array([*means, tica_0, tica_01, states])
 
 
-def decorrelation(segments: Segments, n_lags: int) -> FloatArray:
-    """Return the recipe's decorrelation curve of one torsion `(n_lags,)`: 1 at lag 0, 0 where nothing is remembered.
-
-    <sin sin'> + <cos cos'> over pairs at each lag, neither demeaned, less the baseline <sin>^2 + <cos>^2, divided by
-    1 - baseline. NaN for a torsion that does not move and at lags longer than every segment.
-    """
-    blocks = Blocks.whole([len(s) for s in segments])
-    total, baseline = np.zeros(n_lags), 0.0
-    for part in (np.sin, np.cos):
-        series = [part(np.asarray(s, dtype=np.float64)) for s in segments]
-        sums = kinetics.lag_sums(series, blocks, n_lags)
-        n = sums.n.sum(0)
-        with np.errstate(invalid="ignore", divide="ignore"):
-            total += np.where(n > 0, sums.xy.sum(0) / n, np.nan)
-        baseline += float(np.nanmean(np.concatenate(series))) ** 2
-    if 1.0 - baseline < 1e-9:
-        return np.full(n_lags, np.nan)
-    return (total - baseline) / (1.0 - baseline)
-
-
 def peptide_charts(inputs: ComparisonInput) -> Measured:
-    """Return the recipe's table as a bar chart and the decorrelation of each torsion, or why they were skipped."""
+    """Return the recipe's table as a bar chart, or why it was skipped."""
     name = f"The peptide papers' recipe (lag {format_time_ps(LAG_PS)}, {N_CLUSTERS} clusters, {N_STATES} states)"
     n = min(s.features.n_frames for s in inputs.samples)
     lag = LAG_PS / inputs.lag_ps
@@ -143,21 +123,4 @@ def peptide_charts(inputs: ComparisonInput) -> Measured:
     numbers = [np.zeros(len(names)), candidate[known], replicate[known]]
     made = [[Estimate(x) for x in own.tolist()] for own in numbers]
     title, y_label = "By the peptide papers' recipe", "distance to the reference"
-    table = bar_chart("distributions", title, caption, y_label, names, made)
-    return Measured(charts=[table, _decorrelation_chart(inputs)])
-
-
-def _decorrelation_chart(inputs: ComparisonInput) -> LineChart:
-    n_lags = min(int(10 * LAG_PS / inputs.lag_ps), max(inputs.reference.features.segment_lengths)) + 1
-    drawn = np.unique(np.geomspace(1, n_lags - 1, 80).astype(int))
-    lines = []
-    for sample, role in zip(inputs.samples, ROLES, strict=True):
-        for kind, group in zip(("backbone", "side chains"), torsion_columns(sample.features), strict=True):
-            curves = np.array([c for s in group if np.isfinite(c := decorrelation(s, n_lags)).any()])
-            if len(curves):
-                # At the longest lags no torsion may have a pair of frames left.
-                mean = np.ma.masked_invalid(curves[:, drawn]).mean(axis=0).filled(np.nan)
-                lines.append(Line(f"{kind}, {role}", role, drawn * inputs.lag_ps, mean))
-    title = "Decorrelation of torsions, by the peptide papers' recipe"
-    caption = "Mean over torsions of (<sin sin'> + <cos cos'> - baseline) / (1 - baseline), not demeaned."
-    return LineChart("kinetics", title, caption, "lag / ps", "decorrelation", tuple(lines), log_x=True)
+    return Measured(charts=[bar_chart("distributions", title, caption, y_label, names, made)])

@@ -9,7 +9,6 @@ from dataclasses import dataclass, field, replace
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
 from surrogate.comparison.measure import distributions
 from surrogate.comparison.measure.distributions import Bins
@@ -27,7 +26,7 @@ from surrogate.comparison.measure.statistics import (
     pooled,
 )
 from surrogate.comparison.measure.structure import Backbone, Family, Features, Groups, Probes, over_groups
-from surrogate.comparison.rows.charts import Chart, Histogram, Section
+from surrogate.comparison.rows.charts import Chart, Histogram
 from systems.chemistry.validity import Geometry
 from systems.scene import Scene
 from systems.units import GAS_CONSTANT_KJ_MOL_K, format_time_ps
@@ -345,20 +344,13 @@ def mean_distance(
     return distance_row(inputs, three, key, group, metric)
 
 
-def densities(
-    counts: Sequence[npt.NDArray[Any]], bins: Bins, label: str, unit: str, section: Section = "distributions"
-) -> Histogram:
-    """Return the densities of counts `(bins.n_total,)` of (reference, candidate, replicate), normalised over all
-    frames, in range or not."""
+def histogram(inputs: ComparisonInput, series: Three, bins: Bins, label: str, unit: str) -> Histogram:
+    """Return the densities of one series `(n,)` per segment and sample, normalised over all frames, in range or not."""
+    counts = [c.sum(0) for c in series_counts(inputs, series, bins)]
     width = (bins.high - bins.low) / bins.n
     ref, cand, rep = (c[: bins.n] / max(c.sum(), 1) / width for c in counts)
     outside = [float(c[bins.n :].sum() / max(c.sum(), 1)) for c in counts]
-    return Histogram(label, unit, bins.edges, ref, cand, rep, (outside[0], outside[1], outside[2]), section)
-
-
-def histogram(inputs: ComparisonInput, series: Three, bins: Bins, label: str, unit: str) -> Histogram:
-    """Return the densities of one series `(n,)` per segment and sample."""
-    return densities([c.sum(0) for c in series_counts(inputs, series, bins)], bins, label, unit)
+    return Histogram(label, unit, bins.edges, ref, cand, rep, (outside[0], outside[1], outside[2]))
 
 
 def reference_of(reference: Estimate, replicate: Estimate, *, log: bool = False) -> Estimate:

@@ -1,10 +1,8 @@
-"""Frames that are molecules: every check of every frame, potential energies; and frames that are
-copies of others."""
+"""Frames that are molecules: every check of every frame; and frames that are copies of others."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -12,35 +10,19 @@ import numpy as np
 import numpy.typing as npt
 
 from surrogate.comparison.measure import distributions
-from surrogate.comparison.measure.distributions import Bins
-from surrogate.comparison.measure.statistics import BoolArray, Estimate, FloatArray, estimate, excess_p
+from surrogate.comparison.measure.statistics import BoolArray, Estimate, estimate, excess_p
 from surrogate.comparison.measure.structure import Features
-from surrogate.comparison.read.ensemble import Ensemble
 from surrogate.comparison.rows.rows import (
     ComparisonInput,
     Measured,
-    Quantity,
     Row,
     Skipped,
-    block_means,
-    bounds,
-    densities,
     left_out,
-    mean_row,
-    three_means,
 )
 from systems.chemistry import validity
 from systems.chemistry.validity import Geometry
-from systems.units import GAS_CONSTANT_KJ_MOL_K
 
 TORN_NM = 0.25
-# Positions `(n_atoms, 3)` nm of one frame to kJ/mol; not finite where the frame has none.
-EnergyFn = Callable[[FloatArray], float]
-
-_ENERGY = "Potential energy"
-N_ENERGIES = 400
-_HIGH_QUANTILE = 0.99
-_BINS = 40
 # Frames are compared by so many angles, on a grid in rad.
 _KEY_COLUMNS, _GRID = 6, 1e-3
 # Copies are named from this share on; a candidate of which so much is the reference's own is not compared.
@@ -143,48 +125,6 @@ def _share_row(inputs: ComparisonInput, check: Check, key: str) -> Row:
         tolerance_text=f"≥ {100 * (1 - check.allowed):g} %, or as the reference" if check.allowed else "all frames",
         statement=f"{said} of frames {check.failing}" if percent > 100.0 - made[0].value else "",
     )
-
-
-def measure_energies(ensemble: Ensemble, energy_fn: EnergyFn, n: int = N_ENERGIES) -> list[FloatArray]:
-    """Return the energies of every k-th frame of each segment `(n_frames,)` kJ/mol, about `n` in all, NaN for those
-    between; infinity for a frame that has none."""
-    stride = max(1, ensemble.n_frames // n)
-    out = [np.full(length, np.nan) for length in ensemble.segment_lengths]
-    for segment, values in zip(ensemble.segments, out, strict=True):
-        frames = np.asarray(segment[::stride], dtype=np.float64)
-        found = np.array([energy_fn(x) if np.isfinite(x).all() else np.inf for x in frames])
-        values[::stride] = np.where(np.isfinite(found), found, np.inf)
-    return out
-
-
-def energy_rows(inputs: ComparisonInput) -> Measured:
-    """Return rows of the mean energy and of the share of frames above the reference's 99 % quantile; a histogram."""
-    measured = [s.features.energy_kj for s in inputs.samples]
-    series = [m for m in measured if m is not None]
-    if len(series) < len(measured):
-        return left_out(_ENERGY, "no energy function was given")
-    known = [np.concatenate([x[~np.isnan(x)] for x in m]) for m in series]
-    finite = known[0][np.isfinite(known[0])]
-    if len(finite) < 20:
-        return left_out(_ENERGY, "fewer than 20 energies of the reference are finite")
-    columns = [[x[:, None] for x in m] for m in series]
-    low, high = bounds([c[np.isfinite(c[:, 0])] for c in columns[0]])
-    # An exploded frame counts as the edge of these limits; only what was not computed is left out.
-    cut = [[np.where(np.isposinf(c), high, c) for c in m] for m in columns]
-    means = [block_means(s, c, (low, high)) for s, c in zip(inputs.samples, cut, strict=True)]
-    limit = float(np.quantile(finite, _HIGH_QUANTILE))
-    above = three_means(inputs, [[np.where(np.isnan(c), np.nan, 100.0 * (c > limit)) for c in m] for m in columns])
-    thermal_kj = GAS_CONSTANT_KJ_MOL_K * inputs.temperature_k
-    name = f"{_ENERGY}, mean over {len(known[1])} frames"
-    mean = Quantity("energy_mean", "structure", name, "kJ/mol", thermal_kj, "± RT")
-    name = f"Frames above {limit:.5g} kJ/mol, the reference's 99 % quantile"
-    share = Quantity("energy_high", "structure", name, "%", 2.0)
-    # From the reference's least energy to twice its range: where a poor candidate lies can be seen.
-    lowest, span = float(finite.min()), max(float(np.ptp(finite)), 1e-6)
-    bins = Bins(lowest - 0.2 * span, lowest + 2.0 * span, _BINS)
-    counts = [np.bincount(bins.index(x), minlength=bins.n_total) for x in known]
-    rows = [mean_row(inputs, mean, means), mean_row(inputs, share, above)]
-    return Measured(rows, [densities(counts, bins, _ENERGY, "kJ/mol", "validity")])
 
 
 def frame_keys(features: Features) -> npt.NDArray[np.void] | None:

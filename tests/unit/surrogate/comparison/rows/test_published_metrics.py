@@ -9,7 +9,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from scipy.signal import lfilter
 from scipy.spatial.distance import jensenshannon
 
 from surrogate.comparison.comparison import Evaluation, compare
@@ -103,16 +102,3 @@ def test_candidates_of_one_length_share_what_is_fitted_on_the_reference(
     assert made == [1200, 1100]
     assert distances(found) == distances(compare(reference, [other], replicate, options=quick).evaluations[0])
     assert distances(found) != distances(short)
-
-
-def test_decorrelation_of_a_torsion_that_diffuses_about_a_mean() -> None:
-    """A Gaussian angle of variance s^2 and correlation c: exactly (exp(s^2 c) - 1) / (exp(s^2) - 1)."""
-    rng = np.random.default_rng(0)
-    a, s = 0.95, 0.7
-    kicks = rng.standard_normal((2, 200_000)) * math.sqrt(1 - a * a)
-    angles = [1.0 + s * x for x in lfilter([1.0], [1.0, -a], kicks, axis=1)]
-    found = published_metrics.decorrelation(angles, 60)
-    exact = (np.exp(s**2 * a ** np.arange(60.0)) - 1) / (np.exp(s**2) - 1)
-    assert found[0] == pytest.approx(1.0)
-    assert found == pytest.approx(exact, abs=0.02)
-    assert np.isnan(published_metrics.decorrelation([np.full(100, 0.3)], 5)).all()
