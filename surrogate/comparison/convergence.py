@@ -90,8 +90,8 @@ class Convergence:
 
     `length`: such as '32 replicas of 3.8 ns'; `reasons`: why it is not converged, a line each; `slowest_ps` of
     `slowest` is the longest relaxation seen in states that are not rare, `needed_ps` how long replicas must be for it
-    (None where nothing that was seen tells); `share_left_start`: of replicas, those that left the state they began in,
-    of the torsion that fewest left; `r_hat`: the worst; `map_p`: that the φ/ψ map changes along the replicas by chance.
+    (None where nothing that was seen tells); `r_hat`: the worst; `map_p`: that the φ/ψ map changes along the replicas by
+    chance.
     """
 
     converged: bool
@@ -102,7 +102,6 @@ class Convergence:
     slowest: str
     slowest_ps: float
     needed_ps: float | None
-    share_left_start: float
     r_hat: float
     map_p: float
     states: tuple[State, ...]
@@ -387,10 +386,6 @@ def _summed_up(states: Sequence[State], map_p: float, lengths: Sequence[int], la
     seen = slowest is not None and slowest_ps < 0.5 * replica_ps
     blind = any(s.entries == 0 == s.exits or (s.entries or 0) + (s.exits or 0) < LEAST_PASSAGES
                 for s in faulty if s.entries is not None)  # fmt: skip
-    moved = {
-        t: sum(s.left for s in states if s.torsion == t) / max(sum(s.started for s in states if s.torsion == t), 1)
-        for t in {s.torsion for s in common if s.entries is not None and s.started}
-    }
     return Convergence(
         converged=not reasons,
         reasons=tuple(reasons),
@@ -400,7 +395,6 @@ def _summed_up(states: Sequence[State], map_p: float, lengths: Sequence[int], la
         slowest=slowest.label if slowest else "",
         slowest_ps=slowest_ps,
         needed_ps=None if blind or not seen else max(2.0 * replica_ps, 20.0 * slowest_ps),
-        share_left_start=min(moved.values(), default=math.nan),
         r_hat=max((s.r_hat for s in common if not math.isnan(s.r_hat)), default=math.nan),
         map_p=map_p,
         states=tuple(states),

@@ -3,7 +3,6 @@ as other programs take it."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NoReturn
@@ -24,9 +23,6 @@ from systems.library.named_scenes import prepare
 from systems.options import from_field, options_as_keywords
 from systems.scene import Scene
 
-# positions (n_atoms, 3) nm -> potential energy in kJ/mol
-EnergyFn = Callable[[npt.NDArray[np.float64]], float]
-
 
 def _lacks(what: str) -> Any:
     """Return a method that refuses what a surrogate does not have."""
@@ -45,7 +41,6 @@ class SurrogateState:
     positions_nm: npt.NDArray[np.float32]
     time_ps: float
     step: int
-    energy_fn: EnergyFn | None = None
 
     def getPositions(self, asNumpy: bool = False) -> Any:
         """Return positions with their unit: `Vec3`s, or an array `(n_atoms, 3)` with `asNumpy`."""
@@ -65,14 +60,6 @@ class SurrogateState:
     def getStepCount(self) -> int:
         return self.step
 
-    def getPotentialEnergy(self) -> Any:
-        """Return what the simulation's `energy_fn` says of the positions, with its unit."""
-        from openmm import unit
-
-        if self.energy_fn is None:
-            raise SimulationError("a surrogate has no potential energy; give the simulation an energy_fn.")
-        return float(self.energy_fn(self.positions_nm.astype(np.float64))) * unit.kilojoules_per_mole
-
     def getParameters(self) -> dict[str, float]:
         """Return no global parameters: there are none."""
         return {}
@@ -81,6 +68,7 @@ class SurrogateState:
         """Return a box that is none; see `NoBox`."""
         return NoBox()
 
+    getPotentialEnergy = _lacks("potential energy; leave it out")
     getKineticEnergy = _lacks("kinetic energy (nor total energy, nor temperature); leave it out")
     getVelocities = _lacks("velocities; leave them out")
     getForces = _lacks("forces; leave them out")
@@ -134,9 +122,8 @@ class Simulation:
 
     One step is one frame of the weights, `integrator.getStepSize()` long. `currentStep` may be set. Frames are those
     that `rollout` writes for the same seed, replica 0, in the scene's atom order and pose. What a surrogate does not
-    have (kinetic energy, temperature, forces, a box) raises SimulationError where it is asked for and is never zero;
-    the potential energy is what `energy_fn` says, and raises without one. Reporters that ask for such things by default
-    must be told not to: `HDF5Reporter(file, 10, cell=False, potentialEnergy=False, kineticEnergy=False,
+    have (energies, temperature, forces, a box) raises SimulationError where it is asked for and is never zero.
+    Reporters that ask for such things by default must be told not to: `HDF5Reporter(file, 10, cell=False, potentialEnergy=False, kineticEnergy=False,
     temperature=False)`.
 
     `scene` and `weights` are what the command line takes, or a Scene and loaded weights.
@@ -150,7 +137,6 @@ class Simulation:
         scene: str | Path | Scene,
         weights: str | Path | Weights,
         *,
-        energy_fn: EnergyFn | None = None,
         options: SimulationOptions,
     ) -> None:
         import openmm
@@ -162,7 +148,6 @@ class Simulation:
             weights = load_weights(weights_path(weights))
         weights, match = fit_weights(scene, weights, force=options.force, lag_ps=options.lag_ps)
         self.scene, self.weights, self.deviations = scene, weights, match.deviations
-        self.energy_fn = energy_fn
         self.topology = scene.to_openmm_topology()
         self.system = openmm.System()
         for mass in scene.masses_da.tolist():
@@ -252,7 +237,7 @@ class Simulation:
 
     def state(self) -> SurrogateState:
         """Return a snapshot of where the simulation stands."""
-        return SurrogateState(self.positions_nm, self._frames * self.lag_ps, self.currentStep, self.energy_fn)
+        return SurrogateState(self.positions_nm, self._frames * self.lag_ps, self.currentStep)
 
 
 class SurrogateIntegrator:

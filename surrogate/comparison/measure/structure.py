@@ -526,7 +526,7 @@ class Baseline:
                         series.setdefault(family, []).append(np.empty((n, values.shape[1]), dtype=values.dtype))
                     series[family][-1][part] = values
         return Features(
-            ensemble.label, ensemble.lag_ps, phi, psi, lengths, flags, ensemble.chunk_idx, series, probes, None, moved,
+            ensemble.label, ensemble.lag_ps, phi, psi, lengths, flags, ensemble.chunk_idx, series, probes, moved,
             ensemble.grid_nm,
         )  # fmt: skip
 

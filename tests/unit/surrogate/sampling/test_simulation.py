@@ -132,15 +132,6 @@ def test_states_hold_what_was_asked_for(simulation: Simulation, alanine_dipeptid
         simulation.minimizeEnergy()
 
 
-def test_the_potential_energy_is_that_of_the_function(small_weights: Weights, alanine_dipeptide: Scene) -> None:
-    from openmm import unit
-
-    simulation = Simulation(alanine_dipeptide, small_weights, energy_fn=lambda x: float(np.square(x).sum()))
-    expected = float(np.square(simulation.positions_nm.astype(np.float64)).sum())
-    state = simulation.context.getState(energy=True)
-    assert state.getPotentialEnergy().value_in_unit(unit.kilojoules_per_mole) == pytest.approx(expected, rel=1e-12)
-
-
 def test_positions_can_be_set_and_other_molecules_are_refused(
     simulation: Simulation, small_weights: Weights, alanine_dipeptide: Scene
 ) -> None:
