@@ -90,8 +90,8 @@ class Convergence:
 
     `length`: such as '32 replicas of 3.8 ns'; `reasons`: why it is not converged, a line each; `slowest_ps` of
     `slowest` is the longest relaxation seen in states that are not rare, `needed_ps` how long replicas must be for it
-    (None where nothing that was seen tells); `r_hat`: the worst; `map_p`: that the φ/ψ map changes along the replicas by
-    chance.
+    (None where nothing that was seen tells); `r_hat`: the worst; `map_p`: that the φ/ψ map changes along the replicas
+    by chance.
     """
 
     converged: bool

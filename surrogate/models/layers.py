@@ -169,22 +169,18 @@ class CrossAttentionBlock(nn.Module):
 _Model = TypeVar("_Model", bound=nn.Module)
 # Rows that packed weights are laid out for: those of a single replica, where the layout matters most.
 _ROWS = 32
-# Vectors to read from, up to which products of single heads are too small to be fast.
-_FEW = 8
 
 
 def with_lean_parts(model: _Model) -> _Model:
     """Return a copy for inference on a CPU whose transformer blocks, and layers in bf16, are the lean ones; the model
     itself where it has neither."""
-    if not any(isinstance(m, ParallelBlock | CrossAttentionBlock) or _is_bf16(m) for m in model.modules()):
+    if not any(isinstance(m, ParallelBlock) or _is_bf16(m) for m in model.modules()):
         return model
     copied = copy.deepcopy(model)
     for parent in list(copied.modules()):
         for name, child in list(parent.named_children()):
             if isinstance(child, ParallelBlock):
                 setattr(parent, name, LeanBlock(child))
-            elif isinstance(child, CrossAttentionBlock):
-                setattr(parent, name, LeanCrossBlock(child))
             elif isinstance(child, nn.GELU):
                 setattr(parent, name, _Gelu())
             elif isinstance(child, nn.Linear) and _is_bf16(child):
@@ -272,43 +268,6 @@ class LeanBlock(nn.Module):
         out = torch.empty(2, rows, self.n_heads, length, head_dim, dtype=self.dtype, device=qk.device)
         out.copy_(qk.permute(2, 0, 3, 1, 4))
         return cast(tuple[Tensor, Tensor], out.unbind(0))
-
-
-class LeanCrossBlock(nn.Module):
-    """`CrossAttentionBlock` as it is evaluated: of few vectors, all heads read in one product."""
-
-    def __init__(self, block: CrossAttentionBlock) -> None:
-        super().__init__()
-        self.block = block
-        self.own_head = nn.Buffer(torch.eye(block.n_heads)[None, None, :, :, None], persistent=False)
-
-    def forward(self, x: Tensor, context: Tensor) -> Tensor:
-        """See `CrossAttentionBlock.forward`; `x` may be one row (1, n, width) for all of the context."""
-        block = self.block
-        if not 1 < context.shape[-2] <= _FEW:
-            return cast(Tensor, block(x, context))
-        normed = block.norm(x)
-        k, v = block.kv(context).chunk(2, dim=-1)
-        attended = self._read(block.q(normed), k, v)
-        if block.gate is not None:
-            attended = attended * block.gate(normed)
-        x = x + block.out(attended)
-        return cast(Tensor, x + block.mlp(x))
-
-    def _read(self, q: Tensor, k: Tensor, v: Tensor) -> Tensor:
-        """Queries `(b or 1, n, numbers)`, keys and values `(b, m, numbers)` of all heads -> `(b, n, numbers)`."""
-        batch, m, numbers = k.shape
-        q = q.expand(batch, -1, -1)
-        n_heads = self.block.n_heads
-        scores = self._apart(k * (numbers // n_heads) ** -0.5) @ q.transpose(1, 2)
-        shares = torch.softmax(scores.view(batch, m, -1), 1, dtype=torch.float32).to(v.dtype)
-        return shares.view(batch, m * n_heads, -1).transpose(1, 2) @ self._apart(v)
-
-    def _apart(self, z: Tensor) -> Tensor:
-        """`(b, m, numbers)` -> `(b, m heads, numbers)`: a row for each head, all but its own numbers zero."""
-        batch, m, numbers = z.shape
-        rows = z.view(batch, m, 1, self.block.n_heads, -1) * self.own_head.to(z.dtype)
-        return rows.view(batch, -1, numbers)
 
 
 class _Gelu(nn.Module):

@@ -123,8 +123,8 @@ class Simulation:
     One step is one frame of the weights, `integrator.getStepSize()` long. `currentStep` may be set. Frames are those
     that `rollout` writes for the same seed, replica 0, in the scene's atom order and pose. What a surrogate does not
     have (energies, temperature, forces, a box) raises SimulationError where it is asked for and is never zero.
-    Reporters that ask for such things by default must be told not to: `HDF5Reporter(file, 10, cell=False, potentialEnergy=False, kineticEnergy=False,
-    temperature=False)`.
+    Reporters that ask for such things by default must be told not to: `HDF5Reporter(file, 10, cell=False,
+    potentialEnergy=False, kineticEnergy=False, temperature=False)`.
 
     `scene` and `weights` are what the command line takes, or a Scene and loaded weights.
     `force` runs a scene that leaves the training domain where that is possible; `deviations` then says how. `lag_ps`:

@@ -15,9 +15,7 @@ from torch.nn import functional as F
 from surrogate.models.architecture import weights_path
 from surrogate.models.lam_slide.model import Approximator, ApproximatorConfig
 from surrogate.models.layers import (
-    CrossAttentionBlock,
     LeanBlock,
-    LeanCrossBlock,
     PackedLinear,
     ParallelBlock,
     attend,
@@ -166,20 +164,6 @@ def test_rollouts_draw_the_chunks_of_the_plain_networks(precision: str, toleranc
     errors = [abs(one - wanted).mean(axis=(1, 2, 3)) for one in (found, other)]
     assert errors[0].max() < tolerance_nm
     assert errors[1][1] > 5 * tolerance_nm, "another seed draws another chunk"
-
-
-@pytest.mark.parametrize("alike", [True, False])
-@torch.inference_mode()
-def test_few_vectors_are_read_as_many_are(alike: bool) -> None:
-    torch.manual_seed(0)
-    plain = CrossAttentionBlock(16, 6, 2, 8, gated=True).eval()
-    lean = with_lean_parts(nn.Sequential(copy.deepcopy(plain)))[0]
-    assert isinstance(lean, LeanCrossBlock)
-    x, context = torch.randn(1 if alike else 3, 5, 16), torch.randn(3, 4, 6)
-    torch.testing.assert_close(lean(x, context), plain(x, context), rtol=1e-5, atol=1e-5)
-    mixed = context.clone()
-    mixed[:, 0] = 0.0
-    assert not torch.allclose(lean(x, mixed), plain(x, context), atol=1e-3)
 
 
 def test_memory_is_kept_where_it_can_be() -> None:
