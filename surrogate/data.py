@@ -468,10 +468,6 @@ class Survey:
     lag_ps: float
     equilibrium: bool
 
-    @property
-    def one_molecule(self) -> bool:
-        return len(self.scenes) == 1 and not self.unseen
-
 
 @dataclass(frozen=True)
 class References:

@@ -1,5 +1,5 @@
 """The numerical-stability test of weights: long rollouts; inputs that a rollout was not made for (noisy, strained,
-mirrored, with other atoms); other arithmetic; and OpenMM, all by the same criteria."""
+mirrored, with other atoms); and OpenMM, all by the same criteria."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from surrogate.sampling.domain import find_deviations, fit_weights, match_domain
 from systems.chemistry.geometry import torsion
 from systems.chemistry.graph import rotatable_torsions
 from systems.chemistry.validity import BOND_HALF_ANGSTROM, INVALID, NOT_FINITE, Geometry, check_frames
-from systems.errors import InputError, OutOfDomainError, SimulationError, StorageError, SurromdError, first_line
+from systems.errors import InputError, OutOfDomainError, SimulationError, StorageError, SurromdError
 from systems.files.whole_file import create_whole
 from systems.scene import FloatArray, IntArray, Scene, part_of
 from systems.trajectory.codec import open_trajectory
@@ -37,7 +37,6 @@ ReportFn = Callable[[str], None]
 TITLES = {
     "length": "Long rollouts",
     "inputs": "Inputs pushed out of the training domain",
-    "precision": "Arithmetic: the first chunk against float32",
     "openmm": "OpenMM itself, by the same criteria",
 }
 NOISE_NM = (0.001, 0.01, 0.1)
@@ -100,7 +99,6 @@ def run_stress(
             for n in frames
         ],
         "inputs": lambda: measure_odd_inputs(weights, chunks=2 if is_quick else 4, seed=seed),
-        "precision": lambda: measure_precision(weights, seed=seed),
         "openmm": lambda: measure_openmm(weights, n_frames=20 if is_quick else 200, seed=seed),
     }
     result: dict[str, Any] = {
@@ -285,29 +283,6 @@ def measure_odd_inputs(weights: Weights, *, chunks: int = 4, seed: int = 0) -> l
             for key, part in (("first_%", slice(sampler.n_new)), ("last_%", slice(-sampler.n_new, None))):
                 row[key] = measure_validity(list(frames[:, part]), geometry)["valid_half_angstrom_%"]
         rows.append(row)
-    return rows
-
-
-def measure_precision(weights: Weights, *, seed: int = 0) -> list[dict[str, Any]]:
-    """Return of each arithmetic how far the first chunk of eight replicas is from float32's: the greatest coordinate
-    and the root mean square, nm; validity is that of this one chunk."""
-    geometry = Geometry.from_dict(weights.domain.geometry)
-    reference: Frames | None = None
-    rows: list[dict[str, Any]] = []
-    for name in ("fp32", "bf16"):
-        try:
-            sampler = ChunkSampler(weights, precision=name)
-            Roller(weights, sampler, rows=_ROWS, seed=seed).advance(sampler.n_new)  # what is cached at first
-            started = time.process_time()
-            frames = Roller(weights, sampler, rows=_ROWS, seed=seed).advance(sampler.n_new)
-        except (SurromdError, RuntimeError, OSError, ImportError) as error:
-            rows.append({"arithmetic": name, "outcome": f"not run: {first_line(error)[:120]}"})
-            continue
-        speed = _per_cpu_s(frames, started)
-        reference = frames if reference is None else reference
-        gap = np.abs(frames - reference)
-        row = {"deviation_nm": float(gap.max()), "rms_nm": float(np.sqrt(np.square(gap).mean()))}
-        rows.append({"arithmetic": name, **row, **measure_validity(list(frames), geometry), **speed})
     return rows
 
 

@@ -486,7 +486,7 @@ def stress(
     options: StressOptions,
     as_json: JsonOpt = False,
 ) -> None:
-    """Stress-test WEIGHTS: long rollouts, unusual inputs, precision, beside OpenMM."""
+    """Stress-test WEIGHTS: long rollouts and unusual inputs, beside OpenMM."""
     from surrogate.bench import stress as bench
 
     _measure(

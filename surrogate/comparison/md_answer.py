@@ -156,12 +156,6 @@ class Answer:
             f"{worst.torsion} {worst.state}: {instead}."
         )
 
-    @property
-    def model_error(self) -> float:
-        """Root mean square difference of the surrogate's populations from MD's, 0 without a surrogate."""
-        off = [(s.surrogate - s.share) ** 2 for s in self.states if s.surrogate is not None and not s.missing]
-        return math.sqrt(sum(off) / len(off)) if off else 0.0
-
     def to_dict(self) -> dict[str, Any]:
         """Return JSON-able values; weights are in the trajectories."""
         found = {key: value for key, value in vars(self).items() if key not in ("weights", "states", "maps")}

@@ -81,8 +81,3 @@ class RolloutConfig:
         """What is asked for of the integration, by the names of a potential's settings."""
         names = ("temperature_k", "friction_per_ps", "timestep_ps", "hydrogen_mass_da", "ensemble")
         return {name: getattr(self, name) for name in names if getattr(self, name) is not None}
-
-    @property
-    def needs_openmm(self) -> bool:
-        """Whether frames are relaxed or simulated by OpenMM."""
-        return self.guard in ("repair", "fallback") or self.energy_every > 0

@@ -375,7 +375,7 @@ def rollout(
         header |= {"settings": plan.settings, "n_frames_wanted": plan.n_frames}
         sampler.batch, sampler.drawn, sampler.evaluations = state.batch, state.drawn, state.evaluations
         coupling = None
-        if config.needs_openmm:
+        if config.guard in ("repair", "fallback") or config.energy_every:
             coupling = Coupling(weights)
             stack.callback(coupling.close)
         potential = PotentialChecks(weights, coupling) if isinstance(weights.model, Potential) else None

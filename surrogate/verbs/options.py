@@ -251,8 +251,8 @@ class StressOptions(Seeded, Quiet):
     )
     sections: Sequence[str] = option(
         "Test to run; repeatable.",
-        ("length", "inputs", "precision", "openmm"),
-        choices=("length", "inputs", "precision", "openmm"),
+        ("length", "inputs", "openmm"),
+        choices=("length", "inputs", "openmm"),
         words=("section",),
     )
     scene: str | None = option(

@@ -439,7 +439,7 @@ class LamSlideTrainer(arch.Trainer):
 
 
 def _suits(survey: Survey) -> tuple[int, str] | None:
-    return (0, "one molecule") if survey.one_molecule else None
+    return (0, "one molecule") if len(survey.scenes) == 1 and not survey.unseen else None
 
 
 LAM_SLIDE = arch.Architecture("lam-slide", LamSlideConfig.from_dict, LamSlide, LamSlideTrainer, _suits)

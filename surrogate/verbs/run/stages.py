@@ -17,8 +17,8 @@ from surrogate.comparison.verdict import LEAST_SAMPLES
 from surrogate.verbs.compare import compare
 from surrogate.verbs.inputs import summarised_outputs
 from surrogate.verbs.options import MDSettings, ReferenceOptions, RolloutOptions, RunOptions, TrainOptions
-from surrogate.verbs.run.decision import Decision, Stage, Way, errors_in_words, expected_errors, md_ps, table
-from surrogate.verbs.run.rates import Rates, Rolls, rollout_rate
+from surrogate.verbs.run.decision import Decision, Stage, Way, md_ps, table
+from surrogate.verbs.run.rates import Rates, rollout_rate
 from surrogate.verbs.run.run_record import ANSWER_NAME, REPORT_NAME, Outcome, RunRecord
 from surrogate.verbs.simulate import rollout
 from surrogate.verbs.train import train
@@ -230,12 +230,6 @@ def _rolling(site: Site, record: RunRecord) -> RunRecord | None:
     return replace(record, weights=WEIGHTS_NAME, rates=replace(rates, rolls=replace(rolled, weights=WEIGHTS_NAME)))
 
 
-def _rolled_paths(site: Site, rolls: Rolls) -> list[Path]:
-    from systems.files.whole_file import replica_paths
-
-    return replica_paths(site.folder / f"trajectory/surrogate.{site.options.format}", rolls.replicas)
-
-
 def _roll(site: Site, record: RunRecord) -> RunRecord:
     rates, decision = _rates_and_decision(record)
     assert rates.rolls is not None
@@ -265,10 +259,13 @@ def _roll(site: Site, record: RunRecord) -> RunRecord:
 
 
 def _rolled(site: Site, record: RunRecord) -> RunRecord | None:
+    from systems.files.whole_file import replica_paths
+
     rates, _ = _rates_and_decision(record)
     if rates.rolls is None:
         return None
-    files = _with_frames(site.folder, _rolled_paths(site, rates.rolls))
+    outs = replica_paths(site.folder / f"trajectory/surrogate.{site.options.format}", rates.rolls.replicas)
+    files = _with_frames(site.folder, outs)
     return replace(record, trajectory=files) if files else None
 
 
@@ -457,10 +454,6 @@ def _report(site: Site, record: RunRecord) -> RunRecord:
     said = (*(() if answer is None else (UNWEIGHTED,)), *notable(comparison.notes))
     comparison = replace(comparison, notes=said, evaluations=(evaluated,))
     lines = [*(answer.table() if answer else ()), *table(rates, decision, site.options.budget_s).items()]
-    if answer is not None and answer.timescales_ps:
-        errors = expected_errors(rates, record.settings["budget_s"], answer.timescales_ps[0], answer.model_error)
-        slow = format_time_ps(answer.timescales_ps[0], 2)
-        lines.append(("looking back", f"{errors_in_words(errors)}, with the slowest relaxation that was found, {slow}"))
     write_report(
         comparison,
         site.folder / REPORT_NAME,
