@@ -50,73 +50,62 @@ _STIFF_NM = 5e-4
 
 
 def stress(
-    weights: str | Path, folder: Path, options: StressOptions, *, report: ReportFn = lambda name: None
+    weights: str | Path | Weights, folder: Path, options: StressOptions, *, report: ReportFn = lambda name: None
 ) -> dict[str, Any]:
-    """Run a stress test of weights, by name or file, and write its tables into `folder`; return its rows.
+    """Run a stress test of weights and return the rows of its sections, JSON-able; rollouts stay in `folder` and are
+    resumed when run again, stress.json and stress.md are written anew after each section.
 
-    Weights of several peptides are tried on `options.scene`, or the first that they were trained on. Raises
-    SurromdError for weights that cannot be loaded or do not cover the scene and a folder that cannot be written;
-    KeyboardInterrupt says what is kept.
+    `weights`: a name, a file, or loaded ones; those of several peptides are tried on `options.scene`, or the first that
+    they were trained on. `report` is called with each section as it begins. Raises SurromdError for weights that cannot
+    be loaded or do not cover the scene, and what cannot be written; KeyboardInterrupt says what is kept.
     """
     from surrogate.models.architecture import weights_path
     from surrogate.models.weights import load_weights
 
-    loaded = load_weights(weights_path(weights))
+    loaded = load_weights(weights_path(weights)) if isinstance(weights, str | Path) else weights
     if options.scene is not None:
         from systems.library.named_scenes import prepare
 
         loaded, _ = fit_weights(prepare(options.scene), loaded)
     elif loaded.domain.transferable:
         loaded, _ = fit_weights(loaded.domain.scene, loaded)
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise StorageError(f"cannot make the folder {folder} ({error.strerror}); name another with `out`.") from error
-    try:
-        return run_stress(loaded, folder, options, report=report)
-    except KeyboardInterrupt:
-        raise KeyboardInterrupt(f"{folder} keeps what was done; the same command goes on") from None
-
-
-def run_stress(
-    weights: Weights, folder: Path, options: StressOptions, *, report: ReportFn = lambda name: None
-) -> dict[str, Any]:
-    """Run the sections and return their rows, JSON-able; rollouts stay in `folder` and are resumed when run again.
-    Weights are for one molecule (`sampling.domain.fit_weights`).
-
-    stress.json and stress.md are written anew after each section. `report` is called with each section as it begins.
-    Raises SurromdError where a rollout cannot be written.
-    """
     is_quick, seed = options.quick, options.seed
     frames = options.frames or ((1_000,) if is_quick else (10_000, 100_000))
     replicas = options.replicas or (4 if is_quick else 16)
     if min(frames) < 10 * replicas:
         raise InputError(f"rollouts need at least ten frames in each of {replicas} replicas.")
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise StorageError(f"cannot make the folder {folder} ({error.strerror}); name another with `out`.") from error
     run: dict[str, Callable[[], list[dict[str, Any]]]] = {
         "length": lambda: [
-            measure_length(weights, folder, n, replicas=replicas, guard=guard, seed=seed)
+            measure_length(loaded, folder, n, replicas=replicas, guard=guard, seed=seed)
             for guard in options.guards
             for n in frames
         ],
-        "inputs": lambda: measure_odd_inputs(weights, chunks=2 if is_quick else 4, seed=seed),
-        "openmm": lambda: measure_openmm(weights, n_frames=20 if is_quick else 200, seed=seed),
+        "inputs": lambda: measure_odd_inputs(loaded, chunks=2 if is_quick else 4, seed=seed),
+        "openmm": lambda: measure_openmm(loaded, n_frames=20 if is_quick else 200, seed=seed),
     }
     result: dict[str, Any] = {
-        "weights": weights.path.name,
-        "weights_hash": weights.hash,
-        "model": weights.model.arch,
-        "domain": weights.domain.describe(),
-        "scene": weights.domain.scene.name,
+        "weights": loaded.path.name,
+        "weights_hash": loaded.hash,
+        "model": loaded.model.arch,
+        "domain": loaded.domain.describe(),
+        "scene": loaded.domain.scene.name,
         "made": datetime.now(UTC).isoformat(timespec="seconds"),
         "machine": machine_facts(),
         "seed": seed,
         "sections": {},
     }
-    for name in (name for name in TITLES if name in options.sections):
-        report(name)
-        result["sections"][name] = run[name]()
-        create_whole(folder / "stress.json", json.dumps(result, indent=1))
-        create_whole(folder / "stress.md", markdown(result))
+    try:
+        for name in (name for name in TITLES if name in options.sections):
+            report(name)
+            result["sections"][name] = run[name]()
+            create_whole(folder / "stress.json", json.dumps(result, indent=1))
+            create_whole(folder / "stress.md", markdown(result))
+    except KeyboardInterrupt:
+        raise KeyboardInterrupt(f"{folder} keeps what was done; the same command goes on") from None
     return result
 
 

@@ -28,7 +28,6 @@ from systems.trajectory.joined import join
 from systems.units import format_time_ps
 
 if TYPE_CHECKING:
-    from md_reference.campaign.campaign_file import Campaign
     from md_reference.campaign.scheduler import CampaignProgress
     from md_reference.run.simulate import MDConfig
     from systems.scene import Scene
@@ -222,7 +221,14 @@ def campaign(file: PathLike, out: PathLike | None = None, *, options: CampaignOp
 
     asked = read_campaign(file, folder=out)
     if options.dry_run:
-        return _list_runs(asked)
+        total = format_time_ps(sum(run.config.time_ps for run in asked.runs))
+        return {
+            "file": str(asked.folder),
+            "type": "campaign (not started)",
+            "summary": f"{len(asked.runs)} runs of {len(asked.scenes)} scenes, {total} in all",
+            "scenes": {scene.name: scene.source for scene in asked.scenes},
+            "runs": {run.name: f"{format_time_ps(run.config.time_ps)}, seed {run.config.seed}" for run in asked.runs},
+        }
     manifest = open_campaign(asked)  # another campaign's folder is refused before any worker starts
     if manifest.counts().get(COMPLETE, 0) == len(manifest.runs):
         return describe_campaign(asked.folder)
@@ -251,19 +257,6 @@ def campaign(file: PathLike, out: PathLike | None = None, *, options: CampaignOp
         summary = describe_campaign(asked.folder)["summary"]
         raise KeyboardInterrupt(f"{asked.folder}: {summary}; the same command goes on") from None
     return describe_campaign(asked.folder)
-
-
-def _list_runs(campaign: Campaign) -> dict[str, Any]:
-    """Return what a campaign will run, before anything is started (JSON-able)."""
-    runs = campaign.runs
-    total = format_time_ps(sum(run.config.time_ps for run in runs))
-    return {
-        "file": str(campaign.folder),
-        "type": "campaign (not started)",
-        "summary": f"{len(runs)} runs of {len(campaign.scenes)} scenes, {total} in all",
-        "scenes": {scene.name: scene.source for scene in campaign.scenes},
-        "runs": {run.name: f"{format_time_ps(run.config.time_ps)}, seed {run.config.seed}" for run in runs},
-    }
 
 
 def describe_campaign(folder: Path) -> dict[str, Any]:

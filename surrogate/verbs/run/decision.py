@@ -161,7 +161,8 @@ def _choose(rates: Rates, budget_s: float, way: str) -> tuple[Way, tuple[str, ..
         errors = expected_errors(rates, budget_s)
         best = min(error for name, error in errors.items() if "rollout" in name)
         pays = best < errors["MD from many starts"]
-        why = (rates.coverage, f"{errors_in_words(errors)}, with {rates.relaxation_words}")
+        said = ", ".join(f"{100 * error:.2g} % by {name}" for name, error in errors.items())
+        why = (rates.coverage, f"error to expect of a population: {said}, with {rates.relaxation_words}")
         return "rollout" if pays or way == "surrogate" else "md", why
     none = f"no weights: {rates.coverage}"
     if rates.expensive and rates.in_water:
@@ -222,12 +223,6 @@ def expected_errors(
         )
         found |= {"a rollout alone": whole, "MD from rollout frames": by_md(shares["held-out md"], min(short, 0.5))}
     return found
-
-
-def errors_in_words(errors: dict[str, float]) -> str:
-    """Return the line that says a decision."""
-    said = ", ".join(f"{100 * error:.2g} % by {name}" for name, error in errors.items())
-    return f"error to expect of a population: {said}"
 
 
 def table(rates: Rates, decision: Decision, budget_s: float) -> dict[str, str]:

@@ -17,7 +17,7 @@ from surrogate.bench.stress import (
     measure_odd_inputs,
     measure_openmm,
     measure_validity,
-    run_stress,
+    stress,
 )
 from surrogate.bench.timing import openmm_of
 from surrogate.models.weights import Weights
@@ -86,7 +86,7 @@ def test_odd_inputs_are_refused_with_their_reason(small_weights: Weights) -> Non
 def test_a_whole_stress_test_writes_its_tables(tmp_path: Path, small_weights: Weights) -> None:
     options = StressOptions(frames=[80], replicas=2, guards=["off"], sections=["length"], quick=True)
     shown: list[str] = []
-    result = run_stress(small_weights, tmp_path, options, report=shown.append)
+    result = stress(small_weights, tmp_path, options, report=shown.append)
     assert shown == ["length"]
     (row,) = result["sections"]["length"]
     assert row["frames"] == 80 and 0.0 <= row["valid_half_angstrom_%"] <= 100.0
@@ -94,10 +94,10 @@ def test_a_whole_stress_test_writes_its_tables(tmp_path: Path, small_weights: We
     text = (tmp_path / "stress.md").read_text()
     assert "## Long rollouts" in text and "chunks helped" in text and text == markdown(result)
     other = replace(small_weights, hash="another")
-    (row,) = run_stress(other, tmp_path, replace(options, sections=["length"]))["sections"]["length"]
+    (row,) = stress(other, tmp_path, replace(options, sections=["length"]))["sections"]["length"]
     assert "complete, but of weights_hash" in row["outcome"], "rollouts of other weights are not taken for its own"
     with pytest.raises(InputError, match="ten frames"):
-        run_stress(small_weights, tmp_path, StressOptions(frames=[100], replicas=16))
+        stress(small_weights, tmp_path, StressOptions(frames=[100], replicas=16))
 
 
 @pytest.mark.parametrize("rigid", [True, False])

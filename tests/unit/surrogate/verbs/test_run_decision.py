@@ -13,7 +13,6 @@ from surrogate.verbs.run.decision import (
     Decision,
     PlannedStage,
     decide,
-    errors_in_words,
     expected_errors,
     seconds_of_first,
     table,
@@ -123,7 +122,6 @@ def test_each_way_is_expected_to_err_by_what_it_forgets_and_what_it_samples() ->
         "a rollout that errs begins MD wrongly"
     )
     assert "a rollout alone" not in expected_errors(UNCOVERED, 120.0)
-    assert errors_in_words({"MD": 0.0512}) == "error to expect of a population: 5.1 % by MD"
 
 
 def test_dear_reference_is_learned_where_there_is_time_to() -> None:
