@@ -84,7 +84,7 @@ def one_of_each_type() -> tuple[LineChart, Landscape, BarChart]:
     x = np.linspace(1.0, 10.0, 5)
     counts = np.random.default_rng(0).poisson(20.0, (8, 6)).astype(float)
     return (
-        LineChart("structure", "Forecast <error>", "against time", "time / ps", "ADE / nm",
+        LineChart("equivalent_time", "Forecast <error>", "against time", "time / ps", "ADE / nm",
                   (Line("reference", "reference", x, x**2, x**2 - 1, x**2 + 1), Line("frozen", "other", x, 0 * x + 3)),
                   log_y=True),
         Landscape("kinetics", "TIC 0 and 1", "TIC 0", "TIC 1", np.linspace(-2, 2, 9), np.linspace(-1, 1, 7),
@@ -200,7 +200,7 @@ def test_every_type_of_chart_is_drawn_and_written(comparison: Comparison) -> Non
     first = comparison.evaluations[0]
     plain = {a.title: a for a in albums(first.charts, 300.0)}
     drawn = {a.title: a for a in albums((*charts, *first.charts), 300.0)}
-    section = "Structure"
+    section = "Equivalent MD time"
     assert len(drawn[section].figures) == len(plain.get(section, Album("", [], "")).figures) + 1
     assert len(drawn["How fast things move"].figures) == len(plain["How fast things move"].figures)
     assert [f.caption.split()[0] for f in drawn["TIC 0 and 1"].figures] == ["Reference", "Candidate", "Replicate",
