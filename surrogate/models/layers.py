@@ -199,7 +199,6 @@ class PackedLinear(nn.Module):
 
     def __init__(self, weight: Tensor, bias: Tensor | None) -> None:
         super().__init__()
-        self.out_features, self.in_features = weight.shape
         self.dtype = weight.dtype
         # Builds of torch for ARM and some others do not multiply packed weights.
         can_pack = torch.backends.mkldnn.is_available() and hasattr(torch.ops.mkldnn, "_reorder_linear_weight")
@@ -210,7 +209,7 @@ class PackedLinear(nn.Module):
         self.register_buffer("bias", None if bias is None else bias.detach().contiguous(), persistent=False)
 
     def forward(self, x: Tensor) -> Tensor:
-        """`(..., in_features)` of any precision -> `(..., out_features)` in the weight's."""
+        """`(..., n_in)` of any precision -> `(..., n_out)` in the weight's."""
         if not self.packed:
             return F.linear(x, self.weight, self.bias)
         multiply = torch.ops.mkldnn._linear_pointwise.default

@@ -379,7 +379,8 @@ def step_rows(inputs: ComparisonInput) -> Measured:
     states that all three hold count: what one run alone has met, and steps in otherwise, is no wrong time."""
     if not (len(inputs.torsions.phi) or len(inputs.torsions.psi) or slow_torsions(inputs.reference.features)):
         return left_out("Steps of torsions from frame to frame", "the scene has no torsion to turn about")
-    squared = [[_squared_steps(x) for x in _angles(s.features)] for s in inputs.samples]
+    # NaN after the last frame.
+    squared = [[np.append(squared_turn(x), np.nan)[: len(x)] for x in _angles(s.features)] for s in inputs.samples]
     states = [
         [np.where((x >= 0) & (y >= 0), _N_STATES * x + y, -1) for x, y in zip(own, apart, strict=True)]
         for own, apart in zip(slow_states(inputs), _states_apart(inputs), strict=True)
@@ -418,11 +419,6 @@ def squared_turn(angles_rad: AnyFloat) -> FloatArray:
     """Return the mean square step in rad² of angles `(n, k)` from frame to frame, `(n - 1,)`."""
     step = np.diff(angles_rad.astype(np.float64), axis=0)
     return np.asarray(((step - 2 * np.pi * np.round(step / (2 * np.pi))) ** 2).mean(axis=1))
-
-
-def _squared_steps(angles_rad: AnyFloat) -> FloatArray:
-    """Return the same with NaN after the last frame, `(n,)`."""
-    return np.append(squared_turn(angles_rad), np.nan)[: len(angles_rad)]
 
 
 def _standardised(total: FloatArray, count: FloatArray, share: FloatArray) -> FloatArray:
