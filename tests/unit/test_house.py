@@ -20,7 +20,6 @@ COMMON_NAMES = {"__init__", "architecture", "config", "model", "base", "choices"
 # May only become shorter: a line goes when what it names is mended.
 MANY_PARAMETERS = {
     "surrogate/sampling/runner.py:rollout": "callbacks beside the settings",
-    "systems/trajectory/foreign_scenes.py:named_scene": "what formats name, each another part",
 }
 
 
