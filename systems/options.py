@@ -174,9 +174,8 @@ class Option:
         for one in value if isinstance(value, list | tuple) else (value,):
             choices, (least, most) = self.choices, self.within
             if choices and one is not None and one not in choices:
-                raise UnknownNameError(
-                    f"{what} {one!r} is unknown; choose {_listed(choices)}.{nearest(str(one), list(choices))}"
-                )
+                meant = nearest(str(one), list(choices))
+                raise UnknownNameError(f"{what} {one!r} is unknown; choose {' or '.join(choices)}.{meant}")
             if isinstance(one, bool) or not isinstance(one, int | float):
                 continue
             if least is not None and one < least:
@@ -192,17 +191,9 @@ def _members(hint: Any) -> list[Any]:
     return [hint]
 
 
-def _listed(names: Sequence[str]) -> str:
-    return " or ".join([", ".join(names[:-1]), names[-1]] if len(names) > 1 else names)
-
-
-def options_of(kind: type) -> dict[str, Option]:
-    """Return the options of a dataclass by name: its own, then those of its bases, each in the order they stand in."""
-    return _options_of(kind)
-
-
 @cache
-def _options_of(kind: Any) -> dict[str, Option]:
+def options_of(kind: Any) -> dict[str, Option]:
+    """Return the options of a dataclass by name: its own, then those of its bases, each in the order they stand in."""
     hints = get_type_hints(kind)
     declared = {f.name: f for f in fields(kind) if _KEY in f.metadata}
     order = dict.fromkeys(name for each in kind.__mro__ for name in get_annotations(each) if name in declared)

@@ -44,19 +44,14 @@ def covalent_radius_nm(symbol: str) -> float:
     return _RADII_NM.get(symbol) or round(_element(symbol).covalent_r / 10.0, 4)
 
 
-def is_element(symbol: str) -> bool:
-    """Whether this is the symbol of a chemical element."""
-    return symbol in ATOMIC_NUMBERS
-
-
 def is_metal(symbol: str) -> bool:
     """Whether this is the symbol of a metal."""
-    return is_element(symbol) and bool(_element(symbol).is_metal)
+    return symbol in ATOMIC_NUMBERS and bool(_element(symbol).is_metal)
 
 
 @cache
 def _element(symbol: str) -> Any:
-    if not is_element(symbol):
+    if symbol not in ATOMIC_NUMBERS:
         raise KeyError(symbol)
     # A Ctrl-C while gemmi is imported would abort the process.
     with deferred_interrupt() as asked:
@@ -121,6 +116,6 @@ def element_symbol(name_field: str, residue_name: str, written: str, *, hetero: 
 def _is_stated(symbol: str, name_field: str) -> bool:
     """Whether an element column is believed. A rare element whose symbol also begins a usual name (HO: holmium, or the
     hydrogen HO2 of a program that fills the column with names) must be the atom's whole name."""
-    if symbol in _COMMON or not is_element(symbol):
+    if symbol in _COMMON or symbol not in ATOMIC_NUMBERS:
         return symbol in _COMMON
     return name_field.strip().upper() == symbol.upper() or symbol[0] not in "BCFHNOPS"

@@ -100,11 +100,6 @@ def is_water_name(residue_name: str) -> bool:
     return residue_name.upper() in _WATERS
 
 
-def amino_acid_names() -> list[str]:
-    """Three-letter names of the twenty."""
-    return list(ONE_LETTER.values())
-
-
 @cache
 def _template(name: str) -> ResidueTemplate:
     if name in _WRITTEN:

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from systems.chemistry.geometry import extend, superposition
-from systems.chemistry.residues import ONE_LETTER, amino_acid_names, template_for
+from systems.chemistry.residues import ONE_LETTER, template_for
 from systems.errors import PreparationError, nearest
 from systems.prepare.records import scene_from_records
 from systems.prepare.repair import fixed_random_numbers, protonation_summary, records_from_openmm, residue_shape
@@ -26,7 +26,7 @@ def parse_sequence(text: str) -> list[str]:
 
     A single known three-letter name is one residue. Raises PreparationError for unknown residues and misplaced caps.
     """
-    allowed = [*amino_acid_names(), *_PROTONATED, "ACE", "NME"]
+    allowed = [*ONE_LETTER.values(), *_PROTONATED, "ACE", "NME"]
     written = text.strip()
     word = written.upper()
     is_named = "-" in word or word in allowed

@@ -359,8 +359,6 @@ class TrajectoryReader(ABC):
 
     def iter_blocks(self, n_frames_per_block: int = 4096) -> Iterator[Float32Array]:
         """Yield positions in consecutive blocks of at most `n_frames_per_block` frames."""
-        if n_frames_per_block < 1:
-            raise InputError(f"{self.path}: a block must hold at least one frame, not {n_frames_per_block}.")
         for start in range(0, self.n_frames, n_frames_per_block):
             yield self.read(start, start + n_frames_per_block)
 

@@ -57,17 +57,6 @@ def write_checkpoint(path: Path, header: dict[str, Any], blob: bytes) -> None:
     create_whole(path, _MAGIC + packed(header, blob))
 
 
-def refuse_foreign(path: Path) -> None:
-    """Raise InputError where a file lies in the place of a checkpoint that is none (of this version)."""
-    if path.is_file():
-        with path.open("rb") as file:
-            if file.read(len(_MAGIC)) != _MAGIC:
-                raise InputError(
-                    f"{path} lies where the checkpoint goes and is none of this version's; move it away, or choose "
-                    "another name."
-                )
-
-
 def read_checkpoint(path: Path) -> Checkpoint:
     """Return the state `(header, blob)` in a checkpoint. Raises InputError when it is damaged."""
     try:
@@ -147,14 +136,16 @@ def locked_outputs(outs: Sequence[Path], *, may_exist: bool) -> Iterator[None]:
     with ExitStack() as stack:
         for out in outs:
             stack.enter_context(OutputLock(out))
-        refuse_foreign(checkpoint_path(outs[0]))
+        path = checkpoint_path(outs[0])
+        if path.is_file() and not path.read_bytes().startswith(_MAGIC):
+            raise InputError(f"{path} lies where the checkpoint goes and is none of this version's; move it away.")
         for out in outs:
             refuse_existing(out, may_exist)
         before = {member for out in outs for member in family(out) if member.exists()}
         try:
             yield
         except BaseException as error:
-            resumable = isinstance(error, KeyboardInterrupt | StorageError) and checkpoint_path(outs[0]).exists()
+            resumable = isinstance(error, KeyboardInterrupt | StorageError) and path.exists()
             for out in outs if not resumable else ():
                 with suppress(SurromdError, OSError):  # what cannot be read may hold frames
                     if not frames_in(out):

@@ -30,7 +30,6 @@ from systems.scene import IntArray
 from systems.trajectory.base import TrajectoryReader
 from systems.trajectory.foreign_scenes import (
     NONE,
-    Format,
     bonds_completed,
     format_of,
     named_scene,
@@ -43,13 +42,6 @@ from systems.trajectory.store import Float32Array, Float64Array
 _NM = 0.1
 # Magic, atoms, step, time, nine numbers of the cell, atoms again; then the precision, a float32.
 _XTC_PRECISION = 56
-
-
-def unit_note(format_: Format) -> tuple[str, ...]:
-    """Return the line on a unit of length that a format does not state, none where it states one."""
-    if not format_.unit_taken:
-        return ()
-    return (f"a {format_.name} file states no unit of length; {format_.unit_taken} is taken.",)
 
 
 def counted_note(time_ps: Float64Array) -> tuple[str, ...]:
@@ -115,7 +107,7 @@ class MdtrajReader(_InMemory):
     def __init__(self, path: Path, top: Path | None) -> None:
         super().__init__(path)
         self._format = format_of(path)
-        self.notes = unit_note(self._format)
+        self.notes = self._format.notes
         stated = None if top is None else scene_from_structure(top, name=path.stem)
         whole = self._load(None if stated is None or self._format.names_atoms else stated.to_mdtraj_topology())
         self._positions = np.asarray(whole.xyz, dtype=np.float32)
@@ -290,7 +282,7 @@ class MdanalysisReader(TrajectoryReader):
 
         super().__init__(path)
         self._format = format_of(path)
-        self.notes = unit_note(self._format)
+        self.notes = self._format.notes
         self._kept: IntArray | None = None
         stated = None
         if top is not None:

@@ -66,6 +66,11 @@ class Format:
     unit_taken: str = ""
     mda: str | None = None
 
+    @property
+    def notes(self) -> tuple[str, ...]:
+        said = f"a {self.name} file states no unit of length; {self.unit_taken} is taken."
+        return (said,) if self.unit_taken else ()
+
 
 XYZ_SUFFIXES = (".xyz", ".extxyz", ".xyz.gz", ".xyz.bz2", ".extxyz.gz")
 FORMATS = (
