@@ -5,7 +5,7 @@ from __future__ import annotations
 from functools import cache
 from typing import Any
 
-from systems.chemistry.residues import template_for
+from systems.chemistry.residues import NAMES, template_for
 from systems.interrupts import deferred_interrupt
 from systems.scene import ATOMIC_NUMBERS
 
@@ -25,9 +25,6 @@ _WEIGHTS_DA = {
 _RADII_NM = {"C": 0.076, "Mn": 0.150, "Fe": 0.142, "Co": 0.138}
 # Elements whose names are seldom the beginning of another atom's: these are also known by an atom's name alone.
 _COMMON = frozenset(_WEIGHTS_DA)
-# Names of ions that are not their element's: CHARMM's, and those of the Protein Data Bank.
-_ION_NAMES = {"SOD": "Na", "POT": "K", "CLA": "Cl", "CAL": "Ca", "CES": "Cs", "LIT": "Li", "RUB": "Rb",
-              "BAR": "Ba", "CAD": "Cd", "IOD": "I", "BRO": "Br", "CU1": "Cu", "3CO": "Co", "3NI": "Ni"}  # fmt: skip
 _ANY_ION = ("ION", "IONS", "IO", "CIO", "IP", "IM", "CIP", "CIM")
 _HALOGENS = ("F", "Cl", "Br", "I")
 _UNNAMED_RESIDUES = ("UNL", "UNK", "LIG", "MOL", "DRG")
@@ -70,7 +67,7 @@ def ion_symbol(name: str) -> str | None:
     """Return the element of a monatomic ion by its name (`SOD`, `Na+`, `CL-`, `ZN2`, `MG`), or None."""
     upper = name.strip().upper()
     bare = upper.rstrip("+-").rstrip("0123456789").rstrip("+-") or upper
-    symbol = _ION_NAMES.get(upper, bare.capitalize())
+    symbol = NAMES["ions"].get(upper, bare.capitalize())
     return symbol if symbol in _COMMON and is_lone_ion(symbol) else None
 
 

@@ -9,7 +9,7 @@ from dataclasses import replace
 import networkx as nx
 import numpy as np
 
-from systems.chemistry.residues import is_water_name, template_for
+from systems.chemistry.residues import NAMES, is_water_name, template_for
 from systems.errors import PreparationError, listed
 from systems.prepare.bonding import are_ions
 from systems.prepare.records import AtomRecord, Bonding, by_residue
@@ -78,15 +78,6 @@ def _freest(oxygen: FloatArray, near: FloatArray, rng: np.random.Generator) -> F
 
 
 _BOUND_ANGSTROM = 3.0
-# What crystals are grown from and frozen in, and what peptides are delivered as salts of: component and heavy atoms.
-_AGENTS = {
-    "1PE": "C10O6", "ACN": "C3O", "ACT": "C2O2", "ACY": "C2O2", "AZI": "N3", "BCT": "CO3", "BME": "C2OS",
-    "BTB": "C8NO5", "CAC": "AsC2O2", "CCN": "C2N", "CIT": "C6O7", "CO3": "CO3", "DIO": "C4O2", "DMF": "C3NO",
-    "DMS": "C2OS", "DTT": "C4O2S2", "EDO": "C2O2", "EOH": "C2O", "EPE": "C8N2O4S", "FLC": "C6O7", "FMT": "CO2",
-    "GOL": "C3O3", "IMD": "C3N2", "IPA": "C3O", "MES": "C6NO4S", "MLI": "C3O4", "MOH": "CO", "MPD": "C6O2",
-    "MRD": "C6O2", "NH4": "N", "NO3": "NO3", "P6G": "C12O7", "PEG": "C4O3", "PG4": "C8O5", "PGE": "C6O4",
-    "PGO": "C3O2", "PO4": "O4P", "SCN": "CNS", "SO4": "O4S", "TFA": "C2F3O2", "TLA": "C4O6", "TRS": "C4NO3",
-}  # fmt: skip
 
 
 def is_water(atoms: Sequence[AtomRecord]) -> bool:
@@ -203,4 +194,4 @@ def resolve_ligands(
 
 def _is_agent(name: str, elements: Sequence[str]) -> bool:
     count = Counter(e for e in elements if e != "H")
-    return _AGENTS.get(name.upper()) == "".join(f"{e}{n if n > 1 else ''}" for e, n in sorted(count.items()))
+    return NAMES["agents"].get(name.upper()) == "".join(f"{e}{n if n > 1 else ''}" for e, n in sorted(count.items()))

@@ -15,6 +15,7 @@ import numpy as np
 from systems.chemistry.distance_bonds import refuse_long_bonds
 from systems.chemistry.element_data import atomic_weight_da
 from systems.chemistry.geometry import near_pairs
+from systems.chemistry.residues import NAMES
 from systems.errors import InputError, PreparationError, first_line, listed
 from systems.prepare.mol2_file import molecule_of, read_mol2
 from systems.prepare.records import file_name_and_provenance, read_text, suffix_of
@@ -215,15 +216,6 @@ def _is_drawing(molecule: Any, conformer: Any) -> bool:
 # ---- salts ----------------------------------------------------------------------------------------------------------
 
 
-# What drugs are sold with (the salts of the pharmacopoeias), uncharged; and water, ammonia and what has no such form.
-_COUNTERIONS = (
-    "Cl", "Br", "I", "F", "O", "N", "OS(O)(=O)=O", "OP(O)(O)=O", "O[N+]([O-])=O", "OC(O)=O", "OCl(=O)(=O)=O",
-    "F[B-](F)(F)F", "F[P-](F)(F)(F)(F)F", "OC=O", "CC(O)=O", "OC(=O)C(F)(F)F", "CCC(O)=O", "OCC(O)=O", "CC(O)C(O)=O",
-    "OC(=O)C(O)=O", "OC(=O)CC(O)=O", "OC(=O)CCC(O)=O", "OC(=O)C=CC(O)=O", "OC(=O)CC(O)C(O)=O", "OC(=O)C(O)C(O)C(O)=O",
-    "OC(=O)CC(O)(CC(O)=O)C(O)=O", "OCC(O)C(O)C(O)C(O)C(O)=O", "CS(O)(=O)=O", "CCS(O)(=O)=O", "OCCS(O)(=O)=O",
-    "OS(=O)(=O)CCS(O)(=O)=O", "OS(=O)(=O)c1ccccc1", "Cc1ccc(cc1)S(O)(=O)=O", "OS(=O)(=O)C(F)(F)F", "COS(O)(=O)=O",
-    "OC(=O)c1cc2ccccc2c(c1O)Cc1c(O)c(cc2ccccc12)C(O)=O", "NC(CO)(CO)CO", "CNCC(O)C(O)C(O)C(O)CO",
-)  # fmt: skip
 # Other metals hold what stands beside them: ferrocene is no salt.
 _MONATOMIC = ("Li", "Na", "K", "Rb", "Cs", "Mg", "Ca", "Sr", "Ba", "Al", "Zn", "F", "Cl", "Br", "I")
 
@@ -261,7 +253,7 @@ def main_molecule(molecule: Any, notes: list[str]) -> Any:
 def _known() -> frozenset[str]:
     from rdkit import Chem
 
-    return frozenset(_key(Chem.MolFromSmiles(smiles)) for smiles in _COUNTERIONS)
+    return frozenset(_key(Chem.MolFromSmiles(smiles)) for smiles in NAMES["counterions"])
 
 
 def _key(part: Any) -> str:
