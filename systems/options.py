@@ -221,7 +221,7 @@ def gather(
     `naming` says what to call an option in a message. Raises MissingOptionError, InputError for an unknown name (with
     the nearest) and what `Option.value` raises.
     """
-    known = options_of(kind)
+    known = options_of(cast(Any, kind))
     values = {} if file is None else read_options(kind, file)
     for name, value in given.items():
         if name not in known:
