@@ -62,10 +62,8 @@ def option(
 
 
 def from_field(kind: type, name: str, default: Any = ..., *, unset: str = "") -> Any:
-    """Return a dataclass field that is the option `name` of the dataclass `kind`.
-
-    With another `default`, None say, what the option comes to is what it is there, or `unset`.
-    """
+    """Return a dataclass field that is the option `name` of the dataclass `kind`. With another `default`, None say,
+    what the option comes to is what it is there, or `unset`."""
     said, shown = cast(Any, kind).__dataclass_fields__[name].metadata[_KEY], options_of(kind)[name]
     if default is ...:
         return field(default=shown.default, metadata={_KEY: said})
@@ -217,10 +215,8 @@ def gather(
     naming: Callable[[Option], str] = attrgetter("name"),
 ) -> T:
     """Return the dataclass `kind` of the options that are `given`, before those of a TOML `file`, before the defaults.
-
     `naming` says what to call an option in a message. Raises MissingOptionError, InputError for an unknown name (with
-    the nearest) and what `Option.value` raises.
-    """
+    the nearest) and what `Option.value` raises."""
     known = options_of(cast(Any, kind))
     values = {} if file is None else read_options(kind, file)
     for name, value in given.items():
@@ -297,11 +293,8 @@ R = TypeVar("R")
 
 def options_as_keywords(kind: type) -> Callable[[Callable[..., R]], Callable[..., R]]:
     """Let a function whose last parameter is `options`, a dataclass `kind`, be called with these options as keywords,
-    which its signature lists and its documentation explains.
-
-    `options=` takes the dataclass itself, `config=` the path of a TOML file; keywords come before both. Any other
-    keyword is a TypeError, as always, which names the nearest.
-    """
+    which its signature lists and its documentation explains. `options=` takes the dataclass itself, `config=` the path
+    of a TOML file; keywords come before both. Any other keyword is a TypeError, as always, which names the nearest."""
     known = options_of(kind)
 
     def decorate(function: Callable[..., R]) -> Callable[..., R]:

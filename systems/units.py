@@ -25,9 +25,8 @@ _NUMBER = re.compile(r"^\s*([-+]?[0-9.]+(?:[eE][-+]?[0-9]+)?)\s*(\S*)\s*$")
 
 class _Dimension(NamedTuple):
     """The units that a text may have, with what each is in ours; where a bare number means ours, "" is among them.
-
-    `shown`: our unit; `what`, `example`: how messages call such a quantity, and write one; `may_be_zero`: as it says.
-    """
+    `shown`: our unit; `what`, `example`: how messages call such a quantity, and write one; `may_be_zero`: as it
+    says."""
 
     units: dict[str, float]
     shown: str

@@ -45,11 +45,9 @@ class SceneEntry:
 
 @dataclass(frozen=True)
 class RunEntry:
-    """One replica of one scene at one temperature; paths are relative to the campaign's folder.
-
-    `sha256`: of each file the run wrote; `frames_sha256`: of what was simulated, the same for the same run on another
-    day. `settings` are those the run was asked for, in our units.
-    """
+    """One replica of one scene at one temperature; paths are relative to the campaign's folder. `sha256`: of each file
+    the run wrote; `frames_sha256`: of what was simulated, the same for the same run on another day. `settings` are
+    those the run was asked for, in our units."""
 
     name: str
     scene: str
@@ -131,10 +129,8 @@ def campaign_folder(path: Path) -> Path | None:
 
 def campaign_trajectories(path: Path, *, verify: bool = False) -> tuple[list[Path], int]:
     """Return the complete trajectories of a campaign, or of a part of it, and how many runs there are not complete.
-
     `path`: the campaign's folder or one within it (a scene, a temperature). Only the manifest says what is complete.
-    Raises InputError when nothing is; with `verify` TrajectoryError when a file is not the one that was written.
-    """
+    Raises InputError when nothing is; with `verify` TrajectoryError when a file is not the one that was written."""
     folder = campaign_folder(path)
     if folder is None:
         raise InputError(f"{path} holds no {MANIFEST_NAME}: it is no campaign's folder.")

@@ -115,11 +115,9 @@ def check_same_campaign(old: Manifest, new: Manifest, folder: Path) -> Manifest:
 
 
 def open_campaign(campaign: Campaign) -> Manifest:
-    """Create the campaign's folder, or take up the one that is there, and return its manifest.
-
-    Raises InputError when the folder belongs to another campaign (with the first key that differs), or holds other
-    things; StorageError when it cannot be written.
-    """
+    """Create the campaign's folder, or take up the one that is there, and return its manifest. Raises InputError when
+    the folder belongs to another campaign (with the first key that differs), or holds other things; StorageError when
+    it cannot be written."""
     folder = campaign.folder
     manifest = new_manifest(campaign)
     if (folder / MANIFEST_NAME).is_file():

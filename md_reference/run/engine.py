@@ -36,11 +36,9 @@ _SPRINGS_GROUP = 31
 
 @dataclass(frozen=True)
 class State:
-    """Positions `(n_atoms, 3)` nm, energies in kJ/mol, kinetic temperature in K.
-
-    Where asked for: velocities `(n_atoms, 3)` nm/ps and forces `(n_atoms, 3)` kJ/mol/nm, without those of constraints.
-    Box vectors `(3, 3)` nm in a periodic system.
-    """
+    """Positions `(n_atoms, 3)` nm, energies in kJ/mol, kinetic temperature in K. Where asked for: velocities `(n_atoms,
+    3)` nm/ps and forces `(n_atoms, 3)` kJ/mol/nm, without those of constraints. Box vectors `(3, 3)` nm in a periodic
+    system."""
 
     positions_nm: FloatArray
     potential_kj_mol: float
@@ -182,11 +180,8 @@ class Engine:
         return self._of_atoms(self._query(forces=True).getForces(asNumpy=True))
 
     def minimise(self, *, max_iterations: int = 0) -> float:
-        """Minimise in place (L-BFGS until converged when 0) and return the energy in kJ/mol.
-
-        Raises SimulationError when the energy is not finite, and PreparationError where quantum forces lead to another
-        molecule.
-        """
+        """Minimise in place (L-BFGS until converged when 0) and return the energy in kJ/mol. Raises SimulationError
+        when the energy is not finite, and PreparationError where quantum forces lead to another molecule."""
         import openmm
 
         # Without this the minimiser may search for ever.

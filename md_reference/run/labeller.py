@@ -63,11 +63,9 @@ class Labels:
 
 
 class Labeller:
-    """GFN2-xTB of one molecule. Use as a context manager or call `close`.
-
-    `n_rearranged` counts the states that were left out since they are another molecule.
-    Raises PreparationError for what GFN2-xTB refuses, and for a molecule whose minimum is another one.
-    """
+    """GFN2-xTB of one molecule. Use as a context manager or call `close`. `n_rearranged` counts the states that were
+    left out since they are another molecule. Raises PreparationError for what GFN2-xTB refuses, and for a molecule
+    whose minimum is another one."""
 
     def __init__(self, scene: Scene, *, workers: int | None = None) -> None:
         self.scene = scene

@@ -35,11 +35,9 @@ class SimdUnavailableError(SimulationError):
 
 @dataclass
 class Terms:
-    """The System in the program's order: `order` (n_atoms,) has the solute first, then waters as O, H, H.
-
-    `rigid` (n, 2) bonds outside water with their `lengths` (n,) nm; the other fields hold what the program's structures
-    of these names do.
-    """
+    """The System in the program's order: `order` (n_atoms,) has the solute first, then waters as O, H, H. `rigid` (n,
+    2) bonds outside water with their `lengths` (n,) nm; the other fields hold what the program's structures of these
+    names do."""
 
     order: IntArray
     n_solute: int

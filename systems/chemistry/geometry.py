@@ -23,10 +23,8 @@ _FEW_POINTS = 300
 
 def torsion(positions_nm: npt.ArrayLike, quads: npt.ArrayLike) -> FloatArray:
     """Return torsion angles `(n_frames, k)` in [-pi, pi], positive by the IUPAC convention (1970, rule 1.2).
-
     `positions_nm (n_frames, n_atoms, 3)` or one frame `(n_atoms, 3)` (then the result is `(k,)`), `quads (k, 4)`.
-    Computed in the dtype given, float32 or float64. Raises InputError for arrays of another shape.
-    """
+    Computed in the dtype given, float32 or float64. Raises InputError for arrays of another shape."""
     x, single = _frames(positions_nm)
     angles = torsion_angle(x.transpose(2, 1, 0), np.asarray(quads, dtype=np.int64).reshape(-1, 4)).T
     return angles[0] if single else angles
@@ -34,9 +32,7 @@ def torsion(positions_nm: npt.ArrayLike, quads: npt.ArrayLike) -> FloatArray:
 
 def near_pairs(points: npt.ArrayLike, reach: float, what: str = "") -> npt.NDArray[np.int64]:
     """Return the pairs i < j `(n, 2)` of points `(n_points, 3)` nearer to each other than `reach`, in ascending order.
-
-    Raises PreparationError, which names `what`, where they stand so close that atoms must coincide.
-    """
+    Raises PreparationError, which names `what`, where they stand so close that atoms must coincide."""
     x = np.asarray(points, dtype=np.float64).reshape(-1, 3)
     if len(x) <= _FEW_POINTS:
         i, j = np.triu_indices(len(x), 1)

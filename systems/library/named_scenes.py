@@ -74,10 +74,8 @@ def double_well() -> Scene:
 
 
 def particles(name: str, law: dict[str, Any], positions_nm: npt.ArrayLike) -> Scene:
-    """Return a scene of particles of 12 Da at `(n, 3)` nm under `law` (see the module).
-
-    Raises InputError when the law is unknown or incomplete.
-    """
+    """Return a scene of particles of 12 Da at `(n, 3)` nm under `law` (see the module). Raises InputError when the law
+    is unknown or incomplete."""
     positions = np.array(positions_nm, dtype=np.float64)
     n = len(positions)
     check_law(law)
@@ -118,12 +116,9 @@ def check_law(law: dict[str, Any]) -> None:
 
 @dataclass(frozen=True)
 class Entry:
-    """One scene of the library.
-
-    `smiles` or `sequence` say what the data file was made from; model systems have neither. `file`: the data file,
-    named after the entry unless it is shared. `own_settings`: of a model system, and `source`, where they come from;
-    `protocols`: names of those that papers simulated this molecule by.
-    """
+    """One scene of the library. `smiles` or `sequence` say what the data file was made from; model systems have
+    neither. `file`: the data file, named after the entry unless it is shared. `own_settings`: of a model system, and
+    `source`, where they come from; `protocols`: names of those that papers simulated this molecule by."""
 
     name: str
     group: str
@@ -192,10 +187,8 @@ def entry(name: str) -> Entry:
 
 
 def load(name: str) -> Scene:
-    """Return a named scene, with bonds, bond orders, masses and residues.
-
-    Raises UnknownNameError, and PreparationError for a peptide that cannot be built.
-    """
+    """Return a named scene, with bonds, bond orders, masses and residues. Raises UnknownNameError, and PreparationError
+    for a peptide that cannot be built."""
     found = entry(name)
     provenance: dict[str, Any] = {"source": "library", "library_name": found.name, "repairs": []}
     if found.group == ANALYTIC:

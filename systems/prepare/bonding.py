@@ -220,9 +220,7 @@ class _Bonds:
 
     def add_hydrogens(self, free: set[int]) -> dict[int, str]:
         """Each hydrogen to the nearest heavy atom of its residue, or of all where the residue's names say nothing.
-
-        Returns how far those are that are far from everything: their heavy atoms may be missing.
-        """
+        Returns how far those are that are far from everything: their heavy atoms may be missing."""
         from scipy.spatial import cKDTree
 
         atoms, x = self.atoms, self.x

@@ -25,11 +25,9 @@ _DIRECTIONS = 64
 def complete_waters(
     waters: Sequence[AtomRecord], others: Sequence[AtomRecord], notes: list[str]
 ) -> tuple[list[AtomRecord], IntArray]:
-    """Return the waters as oxygen and two hydrogens each, in the file's order, and their bonds `(n_bonds, 2)`.
-
-    A hydrogen belongs to the nearest oxygen, within 1.3 Å. Oxygens without their two are given new ones, turned away
-    from what stands near (of `others` and the waters); `notes` says to how many.
-    """
+    """Return the waters as oxygen and two hydrogens each, in the file's order, and their bonds `(n_bonds, 2)`. A
+    hydrogen belongs to the nearest oxygen, within 1.3 Å. Oxygens without their two are given new ones, turned away from
+    what stands near (of `others` and the waters); `notes` says to how many."""
     from scipy.spatial import cKDTree
 
     oxygens = [a for a in waters if a.element == "O"]
@@ -91,11 +89,9 @@ def is_water(atoms: Sequence[AtomRecord]) -> bool:
 def resolve_solvent(
     atoms: Sequence[AtomRecord], kept: Sequence[int], *, keep_water: bool, keep_ions: bool, notes: list[str]
 ) -> tuple[list[int], list[int]]:
-    """Return the indices that stay, and those of waters to be kept beside them; `notes` says what is left out.
-
-    Left out are waters unless `keep_water`, and free ions unless `keep_ions`: monatomic, no N, O or S of anything else
-    within 3 Å. Of a file that holds nothing else, all stays.
-    """
+    """Return the indices that stay, and those of waters to be kept beside them; `notes` says what is left out. Left out
+    are waters unless `keep_water`, and free ions unless `keep_ions`: monatomic, no N, O or S of anything else within 3
+    Å. Of a file that holds nothing else, all stays."""
     # All oxygens of waters may stand before all hydrogens.
     runs = [[kept[k] for k in members] for members in by_residue([atoms[i] for i in kept]).values()]
     water = [run for run in runs if is_water([atoms[i] for i in run])]
@@ -156,12 +152,9 @@ def ligand_atoms(atoms: Sequence[AtomRecord], bonding: Bonding) -> list[int]:
 def resolve_ligands(
     atoms: Sequence[AtomRecord], ligands: Sequence[int], *, keep: bool, drop: bool, notes: list[str]
 ) -> list[int]:
-    """Return which of the ligands stay; `notes` says which do, and which are left out.
-
-    Agents of crystallisation, buffers and counter-ions, known by name and elements, are left out unless `keep`. Raises
-    PreparationError for other ligands where neither keeping nor dropping was asked for, and for kept ones without
-    hydrogens.
-    """
+    """Return which of the ligands stay; `notes` says which do, and which are left out. Agents of crystallisation,
+    buffers and counter-ions, known by name and elements, are left out unless `keep`. Raises PreparationError for other
+    ligands where neither keeping nor dropping was asked for, and for kept ones without hydrogens."""
     residues = {key: [ligands[k] for k in run] for key, run in by_residue([atoms[i] for i in ligands]).items()}
     if not (keep or drop):
         agents = {key for key, members in residues.items() if _is_agent(key[2], [atoms[i].element for i in members])}

@@ -121,12 +121,9 @@ def element_of(atom_type: str, name: str, *, alone: bool = False) -> str | None:
 
 
 def molecule_of(found: Mol2) -> Any:
-    """Return the RDKit molecule (unsanitised, hydrogens explicit) with perceived orders and charges.
-
-    Each molecule of a file is perceived by itself. Of structures that differ in their charge, that of the partial
-    charges is chosen. Raises PreparationError where no Lewis structure fits, or the geometry says that hydrogens are
-    missing.
-    """
+    """Return the RDKit molecule (unsanitised, hydrogens explicit) with perceived orders and charges. Each molecule of a
+    file is perceived by itself. Of structures that differ in their charge, that of the partial charges is chosen.
+    Raises PreparationError where no Lewis structure fits, or the geometry says that hydrogens are missing."""
     from rdkit import Chem
 
     molecule = Chem.RWMol()

@@ -132,10 +132,8 @@ def scene_from_component(text: str, path: Path) -> Scene:
 
 
 def scene_from_rdkit(molecule: Any, *, name: str, provenance: dict[str, Any]) -> Scene:
-    """Return the scene of an RDKit molecule with all hydrogens and one conformer, in its atom order.
-
-    One residue; atoms are called after their element and a number, C1, C2, ... Adds `multiplicity` to the provenance.
-    """
+    """Return the scene of an RDKit molecule with all hydrogens and one conformer, in its atom order. One residue; atoms
+    are called after their element and a number, C1, C2, ... Adds `multiplicity` to the provenance."""
     from rdkit import Chem
 
     drawn = Chem.Mol(molecule)
@@ -166,10 +164,8 @@ def scene_from_rdkit(molecule: Any, *, name: str, provenance: dict[str, Any]) ->
 
 
 def _resolved(molecule: Any, notes: list[str]) -> Any:
-    """Return an unsanitised molecule with all hydrogens, at its own positions if it has three-dimensional ones.
-
-    Raises PreparationError for what is no molecule, or has atoms on one point.
-    """
+    """Return an unsanitised molecule with all hydrogens, at its own positions if it has three-dimensional ones. Raises
+    PreparationError for what is no molecule, or has atoms on one point."""
     require(molecule)
     sanitise(molecule)
     drop_isotopes(molecule, notes)
@@ -221,12 +217,9 @@ _MONATOMIC = ("Li", "Na", "K", "Rb", "Cs", "Mg", "Ca", "Sr", "Ba", "Al", "Zn", "
 
 
 def main_molecule(molecule: Any, notes: list[str]) -> Any:
-    """Return the one molecule that an unsanitised RDKit molecule means, its atoms in their order.
-
-    Counterions, water and further copies beside it are left out and said; of counterions alone the organic one.
-    Its charge stays as written. Raises PreparationError for a mixture: several molecules of which none is known to be a
-    counterion.
-    """
+    """Return the one molecule that an unsanitised RDKit molecule means, its atoms in their order. Counterions, water
+    and further copies beside it are left out and said; of counterions alone the organic one. Its charge stays as
+    written. Raises PreparationError for a mixture: several molecules of which none is known to be a counterion."""
     from rdkit import Chem
 
     parts = list(Chem.GetMolFrags(molecule, asMols=True, sanitizeFrags=False))
@@ -325,10 +318,8 @@ def require(molecule: Any) -> None:
 
 def embed(molecule: Any, *, seed: int, notes: list[str]) -> Any:
     """Return the molecule (all hydrogens in it) with one conformer: ETKDG (Riniker and Landrum, 2015), then MMFF94 or
-    UFF. Stereo that it leaves open is drawn, and said in `notes`.
-
-    Raises PreparationError when RDKit finds no geometry or the geometry has other stereo than the molecule.
-    """
+    UFF. Stereo that it leaves open is drawn, and said in `notes`. Raises PreparationError when RDKit finds no geometry
+    or the geometry has other stereo than the molecule."""
     from rdkit import Chem, rdBase
     from rdkit.Chem import rdDistGeom
     from rdkit.Chem import rdForceFieldHelpers as force_fields

@@ -22,10 +22,8 @@ _N_CA_C, _CA_C_N, _C_N_CA, _CA_C_O = 111.2, 116.2, 121.7, 120.8
 
 
 def parse_sequence(text: str) -> list[str]:
-    """Return three-letter residue names of `ACE-ALA-NME`, or of one-letter code (`SDFS`).
-
-    A single known three-letter name is one residue. Raises PreparationError for unknown residues and misplaced caps.
-    """
+    """Return three-letter residue names of `ACE-ALA-NME`, or of one-letter code (`SDFS`). A single known three-letter
+    name is one residue. Raises PreparationError for unknown residues and misplaced caps."""
     allowed = [*ONE_LETTER.values(), *_PROTONATED, "ACE", "NME"]
     written = text.strip()
     word = written.upper()
@@ -55,10 +53,8 @@ def parse_sequence(text: str) -> list[str]:
 
 
 def build_peptide(text: str, *, ph: float = 7.0) -> Scene:
-    """Return an extended peptide, relaxed in ff14SB without charges; uncapped ends are charged.
-
-    Raises PreparationError for an unknown residue, or one that ff14SB lacks.
-    """
+    """Return an extended peptide, relaxed in ff14SB without charges; uncapped ends are charged. Raises PreparationError
+    for an unknown residue, or one that ff14SB lacks."""
     from openmm import Platform, app, unit
 
     names = parse_sequence(text)

@@ -99,10 +99,8 @@ class _InMemory(TrajectoryReader):
 
 
 class MdtrajReader(_InMemory):
-    """A format that MDTraj reads, whole into memory.
-
-    Raises TrajectoryError for what MDTraj cannot read, InputError when `top` is needed or does not fit.
-    """
+    """A format that MDTraj reads, whole into memory. Raises TrajectoryError for what MDTraj cannot read, InputError
+    when `top` is needed or does not fit."""
 
     def __init__(self, path: Path, top: Path | None) -> None:
         super().__init__(path)
@@ -161,11 +159,9 @@ class MdtrajReader(_InMemory):
 
 
 class StreamReader(TrajectoryReader):
-    """An XTC or TRR file of another program, or a NetCDF file of Amber's convention, read by MDTraj block by block.
-
-    TRR frames without positions are left out. Raises TrajectoryError for what it cannot read, InputError when `top`
-    does not fit.
-    """
+    """An XTC or TRR file of another program, or a NetCDF file of Amber's convention, read by MDTraj block by block. TRR
+    frames without positions are left out. Raises TrajectoryError for what it cannot read, InputError when `top` does
+    not fit."""
 
     def __init__(self, path: Path, top: Path | None) -> None:
         import mdtraj
@@ -309,9 +305,7 @@ class MdanalysisReader(TrajectoryReader):
 
     def _times(self) -> tuple[Float64Array, bool]:
         """Return times `(n_frames,)` ps and whether the file states them; frames without positions are left out.
-
-        MDAnalysis' own time step of 1 ps is none: only formats that state times are asked for them.
-        """
+        MDAnalysis' own time step of 1 ps is none: only formats that state times are asked for them."""
         known = self._format.times != NONE
         times, has = np.arange(self.n_frames, dtype=np.float64), np.ones(self.n_frames, dtype=bool)
         for k, frame in enumerate(self._reader):
@@ -361,11 +355,8 @@ class _Frame(NamedTuple):
 
 class AtomsReader(_InMemory):
     """Reads an XYZ file, or one of ASE's `Trajectory`, whole into memory; names or elements are the file's, bonds found
-    by distance.
-
-    Raises TrajectoryError for a damaged file, one of changing atoms, or where ase is not installed; InputError for a
-    `top` that does not fit.
-    """
+    by distance. Raises TrajectoryError for a damaged file, one of changing atoms, or where ase is not installed;
+    InputError for a `top` that does not fit."""
 
     def __init__(self, path: Path, top: Path | None) -> None:
         super().__init__(path)
