@@ -189,9 +189,13 @@ def _members(hint: Any) -> list[Any]:
     return [hint]
 
 
-@cache
-def options_of(kind: Any) -> dict[str, Option]:
+def options_of(kind: type) -> dict[str, Option]:
     """Return the options of a dataclass by name: its own, then those of its bases, each in the order they stand in."""
+    return _options_of(kind)
+
+
+@cache
+def _options_of(kind: Any) -> dict[str, Option]:
     hints = get_type_hints(kind)
     declared = {f.name: f for f in fields(kind) if _KEY in f.metadata}
     order = dict.fromkeys(name for each in kind.__mro__ for name in get_annotations(each) if name in declared)
@@ -217,7 +221,7 @@ def gather(
     """Return the dataclass `kind` of the options that are `given`, before those of a TOML `file`, before the defaults.
     `naming` says what to call an option in a message. Raises MissingOptionError, InputError for an unknown name (with
     the nearest) and what `Option.value` raises."""
-    known = options_of(cast(Any, kind))
+    known = options_of(kind)
     values = {} if file is None else read_options(kind, file)
     for name, value in given.items():
         if name not in known:

@@ -59,7 +59,7 @@ def many_starts(scene: Scene, conditions: Conditions, n: int, *, hot_ps: float =
     if scene.cell_nm is not None:
         dry = replace(dry, cell_nm=None)
     try:
-        spec = _hot_forces(dry, conditions.force)
+        spec = _hot_forces(conditions.force)
         frames, by = _hot(dry, replace(conditions, force=spec, ensemble="nvt"), n, hot_ps)
         if scene.cell_nm is not None:
             frames = _in_water(
@@ -102,7 +102,7 @@ def _scenes(scene: Scene, frames_nm: FloatArray) -> tuple[Scene, ...]:
     return tuple(replace(scene, positions_nm=frame) for frame in frames_nm)
 
 
-def _hot_forces(dry: Scene, force: ForceFieldSpec) -> ForceFieldSpec:
+def _hot_forces(force: ForceFieldSpec) -> ForceFieldSpec:
     """Return the forces of hot MD: the run's own without its water, GAFF2 at quantum level."""
     if force.force_field == QUANTUM:
         return ForceFieldSpec("gaff2", "vacuum", force.hydrogen_mass_da)
@@ -121,12 +121,11 @@ def _hot(dry: Scene, conditions: Conditions, n: int, hot_ps: float) -> tuple[Flo
     geometry = geometry_from_scene(dry)
     try:
         batches, by = _by_simd(system, conditions, start, hot_ps), "by SIMD replicas"
-        first = next(batches)
+        batch = next(batches)
     except SimdUnavailableError:
         batches, by = _by_openmm(dry, system, on_cpu, start, hot_ps), "by OpenMM"
-        first = next(batches)
+        batch = next(batches)
     found = [start]
-    batch = first
     for _ in range(2 + 4 * n // n_replicas()):
         found += [x for x in batch if not check_frames(x, geometry)[0] & _KEPT]
         if len(found) >= n:

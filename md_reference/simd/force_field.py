@@ -177,7 +177,7 @@ class SimdReplicas:
             self._system.molecule,
             n_atoms=terms.n_solute,
             biases=self._biases,
-            work=aligned((int(self._program.work_floats(terms.n_solute if terms.born else 0)) + 16,)),
+            work=aligned((int(self._program.work_floats(terms.n_solute if terms.molecule["born"] else 0)) + 16,)),
             **terms.molecule,
         )
         if terms.cell_nm is not None:

@@ -54,10 +54,6 @@ class Terms:
     middles_nm: float = 0.0
     constant_kj_mol: float = 0.0
 
-    @property
-    def born(self) -> bool:
-        return bool(self.molecule["born"])
-
 
 def read_terms(system: Any, biased: Sequence[Sequence[int]], width: int) -> Terms:
     """Return the terms of a System; torsions of the atoms in `biased` come first, without a force. `width`: replicas of

@@ -10,7 +10,6 @@ from __future__ import annotations
 import bz2
 import contextlib
 import gzip
-import importlib
 import itertools
 import re
 import tempfile
@@ -130,13 +129,8 @@ class MdtrajReader(_InMemory):
         if n_molecules > 1:
             raise InputError(f"{path} holds {n_molecules} molecules, of which MDTraj reads the first; write PDB.")
         try:
-            if is_mol2:
-                importlib.import_module("pandas")
             with _ascii_path(path) as seen:
                 return mdtraj.load(str(seen), **({} if topology is None else {"top": topology}))
-        except ImportError as error:
-            lacking = error.name or "a package"
-            raise TrajectoryError(f"{path} cannot be read: MDTraj needs {lacking}, which is not installed.") from error
         except Exception as error:  # each MDTraj reader raises errors of its own
             needs = topology is None and not self._format.names_atoms
             hint = " (a format without topology: give one with `top`)" if needs else ""
