@@ -142,6 +142,9 @@ def format_quantity(name: str, value: float) -> str:
         return format_time_ps(value).replace(" ", "")
     if ending == "_per_ps":
         return f"{value:g}/ps"
+    if ending == "_s":
+        size, unit = next(((n, u) for n, u in ((3600, "h"), (60, "min")) if value and value % n == 0), (1, "s"))
+        return f"{value / size:g}{unit}"
     return f"{value:g}{unit_of(name)}"
 
 

@@ -154,11 +154,12 @@ def refuse_changed(before: Handedness, after: Handedness) -> None:
 
 
 def say_inverted(found: Handedness, notes: list[str]) -> None:
-    """Note the residues that are not L, or whose side chain is the other diastereomer, as the file has them."""
+    """Note the residues that are not L, flat, or the other diastereomer at CB, as the file has them."""
+    flat = "flat stereocentres, as the file has them"
     for centre, words in (("CA", "D-residues, as the file has them"), ("CB", "the other diastereomer at CB")):
-        names = [label for (label, atom), sign in found.items() if atom == centre and sign < 0]
-        if names:
-            notes.append(f"{words}: {listed(names)}")
+        for sign, said in ((-1, words), (0, flat)):
+            if names := [label for (label, atom), of in found.items() if atom == centre and of == sign]:
+                notes.append(f"{said}: {listed(names)}")
 
 
 # ---- molecules made whole by cell vectors ---------------------------------------------------------------------------

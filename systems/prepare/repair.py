@@ -11,7 +11,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import lru_cache
 from importlib.resources import files
-from itertools import product
+from itertools import permutations, product
 from pathlib import Path
 from typing import Any
 
@@ -258,8 +258,6 @@ def _keep_hydrogens(
     records: list[AtomRecord], bonds: IntArray, atoms: Sequence[AtomRecord], bonding: Bonding
 ) -> list[AtomRecord]:
     """Put the file's hydrogens back where a heavy atom has as many as before."""
-    from scipy.optimize import linear_sum_assignment
-
     whole = {r.key: r for r in bonding.residues if r.heavy and not r.lacks_hydrogens}
     before, after = bonding.neighbours, neighbours_of(bonds, len(records))
     out = list(records)
@@ -270,10 +268,10 @@ def _keep_hydrogens(
         old = [] if kept is None else [j for j in before[kept] if atoms[j].element == "H"]
         if not new or len(old) != len(new):
             continue
-
-        cost = [[distance_angstrom(records[j], atoms[i]) ** 2 for i in old] for j in new]
-        for a, b in zip(*linear_sum_assignment(cost), strict=True):
-            out[new[a]] = replace(records[new[a]], position_angstrom=atoms[old[b]].position_angstrom)
+        best = min(permutations(old), key=lambda order: sum(
+            distance_angstrom(records[j], atoms[i]) ** 2 for j, i in zip(new, order, strict=True)))  # fmt: skip
+        for j, i in zip(new, best, strict=True):
+            out[j] = replace(records[j], position_angstrom=atoms[i].position_angstrom)
     return out
 
 

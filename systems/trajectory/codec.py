@@ -110,7 +110,7 @@ def open_trajectory(path: str | Path, *, top: str | Path | None = None) -> Traje
     when a topology is needed, or does not fit.
     """
     from systems.trajectory import dcd_file, foreign_readers, hdf5_file, xtc_file
-    from systems.trajectory.foreign_scenes import XYZ_SUFFIXES, format_of
+    from systems.trajectory.foreign_scenes import XYZ_SUFFIXES, is_mdtraj_format
 
     path, top = Path(path), None if top is None else Path(top)
     suffix = path.suffix.lower()
@@ -129,7 +129,7 @@ def open_trajectory(path: str | Path, *, top: str | Path | None = None) -> Traje
         return foreign_readers.StreamReader(path, top)
     if path.name.lower().endswith((*XYZ_SUFFIXES, ".traj")):
         return foreign_readers.AtomsReader(path, top)
-    if format_of(path).reader == "MDTraj":
+    if is_mdtraj_format(path):
         return foreign_readers.MdtrajReader(path, top)
     return foreign_readers.MdanalysisReader(path, top)
 
