@@ -161,10 +161,8 @@ _DENSEST_PER_NM3 = 250.0
 
 
 def lengths_and_angles(cell_nm: npt.ArrayLike) -> tuple[FloatArray, FloatArray]:
-    """Return `(lengths (n, 3) nm, angles (n, 3) degrees)` of box vectors `(n, 3, 3)` nm (rows a, b, c).
-
-    Angles are alpha (between b and c), beta (a and c) and gamma (a and b).
-    """
+    """Return `(lengths (n, 3) nm, angles (n, 3) degrees)` of box vectors `(n, 3, 3)` nm (rows a, b, c). Angles are
+    alpha (between b and c), beta (a and c) and gamma (a and b)."""
     cell = np.asarray(cell_nm, dtype=np.float64)
     lengths = np.linalg.norm(cell, axis=2)
     unit = cell / lengths[:, :, None]

@@ -220,9 +220,7 @@ class _Bonds:
 
     def add_hydrogens(self, free: set[int]) -> dict[int, str]:
         """Each hydrogen to the nearest heavy atom of its residue, or of all where the residue's names say nothing.
-
-        Returns how far those are that are far from everything: their heavy atoms may be missing.
-        """
+        Returns how far those are that are far from everything: their heavy atoms may be missing."""
         atoms, x = self.atoms, self.x
         bonded = {i for pair in self.bonds for i in pair}
         heavy = np.array([i for i, a in enumerate(atoms) if a.element != "H" and i not in self.ions], dtype=np.int64)

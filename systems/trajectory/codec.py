@@ -141,10 +141,8 @@ def to_mdtraj(
     source: str | Path | TrajectoryReader, *, start: int = 0, stop: int | None = None, stride: int = 1
 ) -> Any:
     """Return frames `start:stop:stride` of a trajectory, a path or one that is open, as an `mdtraj.Trajectory`.
-
-    Positions, times, bonds and the cell are taken over. Raises InputError for a file without topology,
-    TrajectoryError for a damaged one.
-    """
+    Positions, times, bonds and the cell are taken over. Raises InputError for a file without topology, TrajectoryError
+    for a damaged one."""
     import mdtraj
 
     from systems.chemistry.distance_bonds import lengths_and_angles
@@ -160,10 +158,8 @@ def to_mdanalysis(
     source: str | Path | TrajectoryReader, *, start: int = 0, stop: int | None = None, stride: int = 1
 ) -> Any:
     """Return frames `start:stop:stride` of a trajectory as an `MDAnalysis.Universe` in memory, in its units (Å, ps).
-
     Names, elements, masses, charges, residues, chains (segments) and bonds are taken over. Its reader knows one time
-    step: frames that are unevenly spaced are refused. Raises InputError, TrajectoryError.
-    """
+    step: frames that are unevenly spaced are refused. Raises InputError, TrajectoryError."""
     import MDAnalysis
     from MDAnalysis.coordinates.memory import MemoryReader
 
@@ -220,11 +216,9 @@ def reweighting(differences_kj_mol: npt.ArrayLike, temperature_k: float) -> tupl
 
 
 def frame_weights(path: str | Path) -> Float64Array:
-    """Return the weights `(n_frames,)` of a trajectory's frames at equilibrium; ones where the file has none.
-
-    All replicas of one answer share a scale, mean 1 over all their frames: concatenate them as the frames. Raises
-    TrajectoryError for a damaged file, or one that has grown since the weights were written.
-    """
+    """Return the weights `(n_frames,)` of a trajectory's frames at equilibrium; ones where the file has none. All
+    replicas of one answer share a scale, mean 1 over all their frames: concatenate them as the frames. Raises
+    TrajectoryError for a damaged file, or one that has grown since the weights were written."""
     with open_trajectory(path) as reader:
         weights, n_frames = reader.weights, reader.n_frames
     if weights is None:

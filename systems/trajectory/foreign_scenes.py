@@ -51,12 +51,9 @@ EVERY, SOME, NONE = "stated", "where stated", "no"
 
 @dataclass(frozen=True)
 class Format:
-    """One format, as the manual's table has it (docs/files.md), which also says what its library makes up.
-
-    `times`: EVERY, SOME or NONE, as files state them. `names_atoms`: whether it needs no `top`.
-    `unit_taken`: the unit that is taken, with a line, where nothing states one. `mda`: MDAnalysis' name of it, where
-    the suffix does not say.
-    """
+    """One format, as the manual's table has it (docs/files.md), which also says what its library makes up. `times`:
+    EVERY, SOME or NONE, as files state them. `names_atoms`: whether it needs no `top`. `unit_taken`: the unit that is
+    taken, with a line, where nothing states one. `mda`: MDAnalysis' name of it, where the suffix does not say."""
 
     name: str
     suffixes: tuple[str, ...]
@@ -65,6 +62,11 @@ class Format:
     names_atoms: bool
     unit_taken: str = ""
     mda: str | None = None
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        said = f"a {self.name} file states no unit of length; {self.unit_taken} is taken."
+        return (said,) if self.unit_taken else ()
 
 
 XYZ_SUFFIXES = (".xyz", ".extxyz", ".xyz.gz", ".xyz.bz2", ".extxyz.gz")
@@ -126,10 +128,8 @@ def scene_from_mdtraj_topology(
     elements: Sequence[str] | None = None,
 ) -> Scene:
     """Return a Scene with the atoms, bonds and bond orders of an `mdtraj.Topology`, at positions `(n_atoms, 3)` nm.
-
     `elements` replaces the topology's. Where no bond order is stated, orders and charges are perceived; they stay 0
-    where the bonds fit no valence (missing hydrogens). Raises InputError when the numbers of atoms differ.
-    """
+    where the bonds fit no valence (missing hydrogens). Raises InputError when the numbers of atoms differ."""
     positions = np.array(positions_nm, dtype=np.float64)
     if positions.shape != (topology.n_atoms, 3):
         raise InputError(f"{source or name}: {topology.n_atoms} atoms in the topology, positions {positions.shape}.")
@@ -211,11 +211,9 @@ def scene_from_structure(top: Path, *, name: str) -> Scene:
 
 
 def scene_from_universe(top: Path, *, name: str) -> Scene:
-    """Return the Scene of a topology that MDAnalysis reads (TPR, GSD, XYZ, LAMMPS data, ...).
-
-    Bonds are the file's, or by covalent radii where it holds none; positions are zero where it holds none. Raises
-    InputError when it cannot be read, or an element is not known.
-    """
+    """Return the Scene of a topology that MDAnalysis reads (TPR, GSD, XYZ, LAMMPS data, ...). Bonds are the file's, or
+    by covalent radii where it holds none; positions are zero where it holds none. Raises InputError when it cannot be
+    read, or an element is not known."""
     import MDAnalysis
 
     format_ = "XYZ" if top.suffix.lower() == ".extxyz" else format_of(top).mda
