@@ -79,9 +79,7 @@ def _is_under_way(interrupt: KeyboardInterrupt, thread: int) -> bool:
 
 def stop_if_asked() -> None:
     """Raise KeyboardInterrupt where this thread has been asked to stop, through `deferred_interrupt` or `stop_when`.
-
-    For whoever waits within a run, for another program, say: nothing would look otherwise.
-    """
+    For whoever waits within a run, for another program, say: nothing would look otherwise."""
     asked: Callable[[], bool] | None = getattr(_thread, "deferred", None) or getattr(_thread, "asked", None)
     if asked is not None and asked():
         raise KeyboardInterrupt
@@ -150,11 +148,9 @@ _GRACE_S = 10.0
 
 
 def end_with_parent(*, grace_s: float = _GRACE_S) -> None:
-    """Watch the parent of this worker process from a thread of its own; to be called once, when the worker starts.
-
-    When the parent is gone (killed, even by `kill -9`) this process gets SIGTERM, at which a run stops between two
-    frames with a checkpoint, and after `grace_s` seconds more it exits. In a process without a parent of ours: nothing.
-    """
+    """Watch the parent of this worker process from a thread of its own; to be called once, when the worker starts. When
+    the parent is gone (killed, even by `kill -9`) this process gets SIGTERM, at which a run stops between two frames
+    with a checkpoint, and after `grace_s` seconds more it exits. In a process without a parent of ours: nothing."""
     parent = multiprocessing.parent_process()
     if parent is None:
         return

@@ -62,10 +62,8 @@ def option(
 
 
 def from_field(kind: type, name: str, default: Any = ..., *, unset: str = "") -> Any:
-    """Return a dataclass field that is the option `name` of the dataclass `kind`.
-
-    With another `default`, None say, what the option comes to is what it is there, or `unset`.
-    """
+    """Return a dataclass field that is the option `name` of the dataclass `kind`. With another `default`, None say,
+    what the option comes to is what it is there, or `unset`."""
     said, shown = cast(Any, kind).__dataclass_fields__[name].metadata[_KEY], options_of(kind)[name]
     if default is ...:
         return field(default=shown.default, metadata={_KEY: said})
@@ -174,9 +172,8 @@ class Option:
         for one in value if isinstance(value, list | tuple) else (value,):
             choices, (least, most) = self.choices, self.within
             if choices and one is not None and one not in choices:
-                raise UnknownNameError(
-                    f"{what} {one!r} is unknown; choose {_listed(choices)}.{nearest(str(one), list(choices))}"
-                )
+                meant = nearest(str(one), list(choices))
+                raise UnknownNameError(f"{what} {one!r} is unknown; choose {' or '.join(choices)}.{meant}")
             if isinstance(one, bool) or not isinstance(one, int | float):
                 continue
             if least is not None and one < least:
@@ -190,10 +187,6 @@ def _members(hint: Any) -> list[Any]:
     if get_origin(hint) in (Union, types.UnionType):
         return [one for kind in get_args(hint) if kind is not types.NoneType for one in _members(kind)]
     return [hint]
-
-
-def _listed(names: Sequence[str]) -> str:
-    return " or ".join([", ".join(names[:-1]), names[-1]] if len(names) > 1 else names)
 
 
 def options_of(kind: type) -> dict[str, Option]:
@@ -226,10 +219,8 @@ def gather(
     naming: Callable[[Option], str] = attrgetter("name"),
 ) -> T:
     """Return the dataclass `kind` of the options that are `given`, before those of a TOML `file`, before the defaults.
-
     `naming` says what to call an option in a message. Raises MissingOptionError, InputError for an unknown name (with
-    the nearest) and what `Option.value` raises.
-    """
+    the nearest) and what `Option.value` raises."""
     known = options_of(kind)
     values = {} if file is None else read_options(kind, file)
     for name, value in given.items():
@@ -306,11 +297,8 @@ R = TypeVar("R")
 
 def options_as_keywords(kind: type) -> Callable[[Callable[..., R]], Callable[..., R]]:
     """Let a function whose last parameter is `options`, a dataclass `kind`, be called with these options as keywords,
-    which its signature lists and its documentation explains.
-
-    `options=` takes the dataclass itself, `config=` the path of a TOML file; keywords come before both. Any other
-    keyword is a TypeError, as always, which names the nearest.
-    """
+    which its signature lists and its documentation explains. `options=` takes the dataclass itself, `config=` the path
+    of a TOML file; keywords come before both. Any other keyword is a TypeError, as always, which names the nearest."""
     known = options_of(kind)
 
     def decorate(function: Callable[..., R]) -> Callable[..., R]:

@@ -204,9 +204,7 @@ def once_per_scene(function: Callable[Concatenate[Scene, P], T]) -> Callable[Con
 
 def select_atoms(scene: Scene, text: str) -> IntArray:
     """Return the atoms `(k,)`, ascending, that a selection in MDTraj's language means, such as 'backbone or name CB'.
-
-    Raises InputError when it cannot be read or means no atom.
-    """
+    Raises InputError when it cannot be read or means no atom."""
     try:
         found = np.asarray(scene.to_mdtraj_topology().select(text), dtype=np.int64)
     except InputError:

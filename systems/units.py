@@ -25,9 +25,8 @@ _NUMBER = re.compile(r"^\s*([-+]?[0-9.]+(?:[eE][-+]?[0-9]+)?)\s*(\S*)\s*$")
 
 class _Dimension(NamedTuple):
     """The units that a text may have, with what each is in ours; where a bare number means ours, "" is among them.
-
-    `shown`: our unit; `what`, `example`: how messages call such a quantity, and write one; `may_be_zero`: as it says.
-    """
+    `shown`: our unit; `what`, `example`: how messages call such a quantity, and write one; `may_be_zero`: as it
+    says."""
 
     units: dict[str, float]
     shown: str
@@ -77,16 +76,6 @@ def _parse(text: str, what: str = "", *, ending: str, zero: bool = False) -> flo
     return value
 
 
-def parse_time_ps(text: str, what: str = "") -> float:
-    """Return a simulated duration in ps (`10ns`). Raises UnitError for a missing, unknown or non-positive quantity."""
-    return _parse(text, what, ending="_ps")
-
-
-def parse_wall_s(text: str, what: str = "") -> float:
-    """Return a wall-clock duration in seconds (`30min`, `2h`). Raises UnitError."""
-    return _parse(text, what, ending="_s")
-
-
 def format_wall(seconds: float) -> str:
     """Return a wall time for people: 12 s, 5 min, 3.2 h, 2.1 days."""
     for unit, size, limit in (("s", 1.0, 120.0), ("min", 60.0, 7200.0), ("h", 3600.0, 172_800.0)):
@@ -95,13 +84,17 @@ def format_wall(seconds: float) -> str:
     return f"{seconds / 86_400.0:.3g} days"
 
 
-def parser_of(name: str) -> Callable[[str, str], float]:
+def _ending(name: str) -> str:
+    return next((ending for ending in DIMENSIONS if name.endswith(ending)), "")
+
+
+def parser_of(name: str) -> Callable[..., float]:
     """Return what reads the text of a setting by its name (`time_ps`): text and what to call it -> its value inside."""
     return functools.partial(_parse, ending=_ending(name), zero=name == "equilibrate_ps")
 
 
-def _ending(name: str) -> str:
-    return next((ending for ending in DIMENSIONS if name.endswith(ending)), "")
+# A simulated duration in ps (`10ns`), a wall-clock one in seconds (`30min`, `2h`).
+parse_time_ps, parse_wall_s = parser_of("time_ps"), parser_of("wall_s")
 
 
 def unit_of(name: str) -> str:
@@ -149,6 +142,9 @@ def format_quantity(name: str, value: float) -> str:
         return format_time_ps(value).replace(" ", "")
     if ending == "_per_ps":
         return f"{value:g}/ps"
+    if ending == "_s":
+        size, unit = next(((n, u) for n, u in ((3600, "h"), (60, "min")) if value and value % n == 0), (1, "s"))
+        return f"{value / size:g}{unit}"
     return f"{value:g}{unit_of(name)}"
 
 

@@ -90,11 +90,9 @@ class _SceneHead:
 
 
 def read_campaign(path: str | Path, *, folder: str | Path | None = None) -> Campaign:
-    """Return the campaign that a TOML file describes; paths in it are relative to the file's folder.
-
-    `folder` replaces the file's own `out`. Raises InputError, in one line, for unknown keys (with the nearest known),
-    values of the wrong kind, scenes named twice, and settings that no run can have.
-    """
+    """Return the campaign that a TOML file describes; paths in it are relative to the file's folder. `folder` replaces
+    the file's own `out`. Raises InputError, in one line, for unknown keys (with the nearest known), values of the wrong
+    kind, scenes named twice, and settings that no run can have."""
     path = Path(path)
     table = read_toml(path)
     try:

@@ -127,10 +127,8 @@ def dask_setup(_: Any) -> None:
 
 def guarded(token: str, witness: Path, work: Callable[[], dict[str, Any]]) -> dict[str, Any]:
     """Return what `work` returns, or how it ended; nothing is raised into Dask, which would count it as its own.
-
     `witness`: a file that whoever started the task has written where the task is to write. What waits within it, for a
-    frame or for another program's charges, hears when the command is to stop.
-    """
+    frame or for another program's charges, hears when the command is to stop."""
     session = session_of(token)
     if session.stopped:
         return {"status": "stopped"}

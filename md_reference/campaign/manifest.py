@@ -8,8 +8,6 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Final, Literal
 
-import numpy as np
-
 from systems.errors import InputError, TrajectoryError
 from systems.files.outside import content
 from systems.files.schema import built, parsed
@@ -47,11 +45,9 @@ class SceneEntry:
 
 @dataclass(frozen=True)
 class RunEntry:
-    """One replica of one scene at one temperature; paths are relative to the campaign's folder.
-
-    `sha256`: of each file the run wrote; `frames_sha256`: of what was simulated, the same for the same run on another
-    day. `settings` are those the run was asked for, in our units.
-    """
+    """One replica of one scene at one temperature; paths are relative to the campaign's folder. `sha256`: of each file
+    the run wrote; `frames_sha256`: of what was simulated, the same for the same run on another day. `settings` are
+    those the run was asked for, in our units."""
 
     name: str
     scene: str
@@ -133,10 +129,8 @@ def campaign_folder(path: Path) -> Path | None:
 
 def campaign_trajectories(path: Path, *, verify: bool = False) -> tuple[list[Path], int]:
     """Return the complete trajectories of a campaign, or of a part of it, and how many runs there are not complete.
-
     `path`: the campaign's folder or one within it (a scene, a temperature). Only the manifest says what is complete.
-    Raises InputError when nothing is; with `verify` TrajectoryError when a file is not the one that was written.
-    """
+    Raises InputError when nothing is; with `verify` TrajectoryError when a file is not the one that was written."""
     folder = campaign_folder(path)
     if folder is None:
         raise InputError(f"{path} holds no {MANIFEST_NAME}: it is no campaign's folder.")
@@ -162,21 +156,8 @@ def file_sha256(path: Path) -> str:
 
 
 def frames_sha256(path: Path) -> str:
-    """Return the SHA-256 of a trajectory's frames, all that is kept of each, whatever the file around them."""
+    """Return a SHA-256 of a trajectory's frames, all that is kept of each, whatever the file around them."""
     from systems.trajectory.codec import open_trajectory
 
-    digest = hashlib.sha256()
-
-    def add(values: Any, kind: str) -> None:
-        digest.update(b"" if values is None else np.asarray(values, dtype=kind).tobytes())
-
     with open_trajectory(path) as reader:
-        add(reader.time_ps, "<f8")
-        for name in sorted(reader.scalars):
-            digest.update(name.encode())
-            add(reader.scalars[name], "<f8")
-        for part in ((start, start + 4096) for start in range(0, reader.n_frames, 4096)):
-            for read in (reader.read, reader.read_velocities, reader.read_forces):
-                add(read(*part), "<f4")
-            add(reader.read_cells(*part), "<f8")
-    return digest.hexdigest()
+        return reader.digest(reader.n_frames)

@@ -57,21 +57,19 @@ def new_manifest(campaign: Campaign) -> Manifest:
     from importlib.metadata import version
 
     programs = {name: version(name) for name in ("openmm", "distributed")}
+    runs = {}
+    for run in campaign.runs:
+        name, kelvin, settings = run.name, run.config.temperature_k, settings_of(run.config)
+        seed = settings.pop("seed")  # which belongs to the run's place among others
+        runs[name] = RunEntry(name, run.scene, kelvin, run.replica, seed, run.file, settings, run.config.n_frames)
     return Manifest(
         name=campaign.name,
         seed=campaign.seed,
         scenes={s.name: SceneEntry(s.name, s.source, s.source_sha256, s.preparation) for s in campaign.scenes},
-        runs={run.name: _new_entry(run) for run in campaign.runs},
+        runs=runs,
         programs={"python": platform.python_version(), **programs},
         started=datetime.now(UTC).isoformat(timespec="seconds"),
     )
-
-
-def _new_entry(run: Run) -> RunEntry:
-    settings = settings_of(run.config)
-    seed = settings.pop("seed")  # which belongs to the run's place among others
-    name, kelvin = run.name, run.config.temperature_k
-    return RunEntry(name, run.scene, kelvin, run.replica, seed, run.file, settings, run.config.n_frames)
 
 
 def check_same_campaign(old: Manifest, new: Manifest, folder: Path) -> Manifest:
@@ -115,11 +113,9 @@ def check_same_campaign(old: Manifest, new: Manifest, folder: Path) -> Manifest:
 
 
 def open_campaign(campaign: Campaign) -> Manifest:
-    """Create the campaign's folder, or take up the one that is there, and return its manifest.
-
-    Raises InputError when the folder belongs to another campaign (with the first key that differs), or holds other
-    things; StorageError when it cannot be written.
-    """
+    """Create the campaign's folder, or take up the one that is there, and return its manifest. Raises InputError when
+    the folder belongs to another campaign (with the first key that differs), or holds other things; StorageError when
+    it cannot be written."""
     folder = campaign.folder
     manifest = new_manifest(campaign)
     if (folder / MANIFEST_NAME).is_file():

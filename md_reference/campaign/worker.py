@@ -53,7 +53,7 @@ class PreparedScene:
             return replace(self.scene, positions_nm=np.array(self.starts_nm[replica]))
         if replica == 0 or config.starts != "many":
             return self.scene
-        return many_starts(self.scene, replace(config, force=self.force, seed=self.seed), replica + 1).scenes[-1]
+        return many_starts(self.scene, replace(config, force=self.force, seed=self.seed), replica + 1)[0][-1]
 
     def summary(self) -> dict[str, Any]:
         """Return what the manifest says of it."""
@@ -93,9 +93,8 @@ def _prepare(path: Path, spec: SceneSpec, config: MDConfig, seed: int, replicas:
     build_system(scene, force)
     prepared = PreparedScene(replace(scene, name=spec.name), force, seed=seed)
     if replicas > 1 and config.starts == "many":
-        starts = many_starts(prepared.scene, replace(config, force=force, seed=seed), replicas)
-        frames = tuple(s.positions_nm.tolist() for s in starts.scenes)
-        prepared = replace(prepared, starts_nm=frames, started=starts.how)
+        starts, how = many_starts(prepared.scene, replace(config, force=force, seed=seed), replicas)
+        prepared = replace(prepared, starts_nm=tuple(s.positions_nm.tolist() for s in starts), started=how)
     record = {
         "scene": prepared.scene.to_dict(),
         "force": asdict(force),

@@ -133,7 +133,7 @@ def _check_cell(scene: Scene, spec: ForceFieldSpec) -> None:
 
 def _build_mixed(scene: Scene, spec: ForceFieldSpec) -> Any:
     """GAFF2 molecules and chains with residues from GAFF2, alone or beside peptides, water and ions."""
-    from openmm import NonbondedForce
+    from openmm import NonbondedForce, app
 
     templated: list[IntArray] = []
     others: list[IntArray] = []
@@ -158,7 +158,8 @@ def _build_mixed(scene: Scene, spec: ForceFieldSpec) -> Any:
                 f"{spec.protein} has no parameters for {', '.join(chain.lacking[:4])} of scene {scene.name!r}; such "
                 "residues are joined to ff14SB alone: use `force_field='ff14SB+gaff2'`."
             )
-        parts.append((atoms, build_chain(chain, spec) if chain is not None else _build_molecule(part, spec)))
+        vacuum = {"nonbondedMethod": app.NoCutoff, "rigidWater": False, **spec.openmm_settings()}
+        parts.append((atoms, build_chain(chain, spec) if chain else gaff.entry(part).system(part, **vacuum)))
     system = merge(scene.n_atoms, parts)
     if spec.is_explicit:
         nonbonded = next(f for f in system.getForces() if isinstance(f, NonbondedForce))
@@ -173,10 +174,3 @@ def _build_mixed(scene: Scene, spec: ForceFieldSpec) -> Any:
             born = native_obc2(topology, system)
         system.addForce(born)
     return system
-
-
-def _build_molecule(scene: Scene, spec: ForceFieldSpec) -> Any:
-    """Return the System of one GAFF2 molecule in vacuum."""
-    from openmm import app
-
-    return gaff.entry(scene).system(scene, nonbondedMethod=app.NoCutoff, rigidWater=False, **spec.openmm_settings())

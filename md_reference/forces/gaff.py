@@ -10,9 +10,7 @@ import gzip
 import json
 import logging
 import tempfile
-import time
-from collections.abc import Iterator
-from contextlib import contextmanager, nullcontext, suppress
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from importlib.resources import files
 from pathlib import Path
@@ -189,8 +187,9 @@ def _parametrise(scene: Scene, charges: str = "bcc") -> Entry:
     tools = ambertools()
     with scratch_folder("surromd-gaff-") as folder:
         try:
-            with announced(scene) if charges == "bcc" else nullcontext():
-                notes = _charges_and_types(scene, folder, charges)
+            if charges == "bcc":
+                announce(scene)
+            notes = _charges_and_types(scene, folder, charges)
             _missing_terms(scene, folder)
             text = _assemble(folder)
         except PreparationError as error:
@@ -339,20 +338,13 @@ def expected_s(n_atoms: int) -> float:
     return SECONDS_AT_30_ATOMS * (n_atoms / 30.0) ** POWER
 
 
-@contextmanager
-def announced(scene: Scene) -> Iterator[None]:
-    """Say before and after a molecule's charges are computed how long that takes, where it is worth saying: warnings of
-    the logger 'surromd.charges', on stderr unless a program that uses this package decides else."""
-    expected = expected_s(scene.n_atoms)
-    if expected < _WORTH_SAYING_S:
-        yield
-        return
-    about = format_wall(float(f"{expected:.1g}"))
-    what = f"AM1-BCC charges of {scene.n_atoms} atoms, about {about} on an idle core, once: they are kept in the cache"
-    _log.warning("%s: %s", scene.name, what)
-    started = time.monotonic()
-    yield
-    _log.warning("%s: charges computed in %s", scene.name, format_wall(time.monotonic() - started))
+def announce(scene: Scene) -> None:
+    """Say how long a molecule's charges will take, where it is worth saying: a warning of the logger 'surromd.charges',
+    on stderr unless a program that uses this package decides else."""
+    if (expected := expected_s(scene.n_atoms)) >= _WORTH_SAYING_S:
+        about = format_wall(float(f"{expected:.1g}"))
+        what = f"AM1-BCC charges of {scene.n_atoms} atoms, about {about} on an idle core, once: they are kept"
+        _log.warning("%s: %s", scene.name, what)
 
 
 # ---- AMBER parameter files (prmtop) ---------------------------------------------------------------------------------

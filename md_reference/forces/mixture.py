@@ -127,11 +127,9 @@ def _moved_terms(force: Any, to: Sequence[int] | None) -> Iterator[list[Any]]:
 
 
 def merge(n_atoms: int, parts: Iterable[tuple[IntArray, Any]]) -> Any:
-    """Return one `openmm.System` of parts that do not share atoms: atom k of a part is particle `atoms[k]`.
-
-    Virtual sites come after all atoms, in order. Parts interact by one NonbondedForce with the usual combination rules,
-    whose settings are those of the first part. Raises PreparationError for forces that cannot be merged.
-    """
+    """Return one `openmm.System` of parts that do not share atoms: atom k of a part is particle `atoms[k]`. Virtual
+    sites come after all atoms, in order. Parts interact by one NonbondedForce with the usual combination rules, whose
+    settings are those of the first part. Raises PreparationError for forces that cannot be merged."""
     import openmm
 
     pieces = []

@@ -33,11 +33,9 @@ _RUN = (
 
 
 def run_program(command: list[str], folder: Path, environment: Mapping[str, str]) -> tuple[int, str]:
-    """Run a program in `folder` until it ends; return its exit status and what it printed, errors among the rest.
-
-    An interruption, also one that `deferred_interrupt` has put off or that is meant for this thread, ends the program
-    and whatever it has started: KeyboardInterrupt. So does the end of this process. POSIX systems only.
-    """
+    """Run a program in `folder` until it ends; return its exit status and what it printed, errors among the rest. An
+    interruption, also one that `deferred_interrupt` has put off or that is meant for this thread, ends the program and
+    whatever it has started: KeyboardInterrupt. So does the end of this process. POSIX systems only."""
     with (
         tempfile.TemporaryFile() as output,
         subprocess.Popen(

@@ -130,10 +130,8 @@ def _one_thread() -> Iterator[None]:
 
 class Potential:
     """GFN2-xTB of one molecule: positions `(n_atoms, 3)` nm -> energy in kJ/mol, forces `(n_atoms, 3)` in kJ/mol/nm.
-
     Charge from the scene's formal charges, unpaired electrons from `provenance["multiplicity"]` (where it says nothing,
-    the fewest possible). `solvent`: vacuum or alpb-water. Raises PreparationError as `build_quantum_system`.
-    """
+    the fewest possible). `solvent`: vacuum or alpb-water. Raises PreparationError as `build_quantum_system`."""
 
     def __init__(self, scene: Scene, solvent: str = "vacuum") -> None:
         from openmm.app import Element

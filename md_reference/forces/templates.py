@@ -177,11 +177,9 @@ def native_obc2(topology: Any, system: Any) -> Any:
 
 
 def gbn2(scene: Scene, topology: Any, system: Any, *, molecule_idx: IntArray | None = None) -> Any:
-    """GBn2 (Nguyen, Roe and Simmerling 2013, igb=8) as OpenMM's CustomGBForce, radii mbondi3.
-
-    Atoms in `molecule_idx` (GAFF2) keep their mbondi2 radii: Amber changes those of protein residues alone. Arginine is
-    known by its bonds, so that a peptide in residues of other names gets the same energy.
-    """
+    """GBn2 (Nguyen, Roe and Simmerling 2013, igb=8) as OpenMM's CustomGBForce, radii mbondi3. Atoms in `molecule_idx`
+    (GAFF2) keep their mbondi2 radii: Amber changes those of protein residues alone. Arginine is known by its bonds, so
+    that a peptide in residues of other names gets the same energy."""
     from openmm.app.internal.customgbforces import GBSAGBn2Force, GBSAOBC2Force
 
     gb = GBSAGBn2Force(SA="ACE")

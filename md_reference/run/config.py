@@ -25,11 +25,9 @@ SIMD = "simd"
 
 @dataclass(frozen=True)
 class Conditions:
-    """What acts on a scene, and where it is computed. Temperature in K, friction in 1/ps, time step in ps.
-
-    `ensemble`: 'nvt' (Langevin middle integrator, Zhang 2019), 'npt' (the same with a Monte Carlo barostat at
-    `pressure_bar`; scenes with a cell only), or 'nve' (velocity Verlet).
-    """
+    """What acts on a scene, and where it is computed. Temperature in K, friction in 1/ps, time step in ps. `ensemble`:
+    'nvt' (Langevin middle integrator, Zhang 2019), 'npt' (the same with a Monte Carlo barostat at `pressure_bar`;
+    scenes with a cell only), or 'nve' (velocity Verlet)."""
 
     force: ForceFieldSpec = field(default_factory=ForceFieldSpec)
     temperature_k: float = option("Thermostat temperature.", 300.0)
@@ -106,11 +104,8 @@ def check_same_run(old: dict[str, Any], config: MDConfig, out: Path, *, ignoring
 
 def resolved(scene: Scene, config: MDConfig) -> MDConfig:
     """Return the settings with force field, solvent and ensemble resolved for this scene (solvated, where the solvent
-    is explicit): the one value that every later stage of a run takes.
-
-    Raises UnknownNameError, InputError for a constant pressure without a periodic cell, and what `forcefield.resolve`
-    raises.
-    """
+    is explicit): the one value that every later stage of a run takes. Raises UnknownNameError, InputError for a
+    constant pressure without a periodic cell, and what `forcefield.resolve` raises."""
     from md_reference.forces.forcefield import resolve  # the builders of forces are slow to import
 
     config = replace(config, ensemble=config.ensemble.lower())

@@ -36,11 +36,9 @@ _SPRINGS_GROUP = 31
 
 @dataclass(frozen=True)
 class State:
-    """Positions `(n_atoms, 3)` nm, energies in kJ/mol, kinetic temperature in K.
-
-    Where asked for: velocities `(n_atoms, 3)` nm/ps and forces `(n_atoms, 3)` kJ/mol/nm, without those of constraints.
-    Box vectors `(3, 3)` nm in a periodic system.
-    """
+    """Positions `(n_atoms, 3)` nm, energies in kJ/mol, kinetic temperature in K. Where asked for: velocities `(n_atoms,
+    3)` nm/ps and forces `(n_atoms, 3)` kJ/mol/nm, without those of constraints. Box vectors `(3, 3)` nm in a periodic
+    system."""
 
     positions_nm: FloatArray
     potential_kj_mol: float
@@ -74,7 +72,9 @@ def refuse_damaged(scene: Scene, minimised_nm: FloatArray) -> None:
     was, now = (np.linalg.norm(x[bonds[:, 0]] - x[bonds[:, 1]], axis=1) for x in (scene.positions_nm, minimised_nm))
     broken = np.flatnonzero((now > _BROKEN * radii_nm) & (was <= _BROKEN * radii_nm))
     if len(broken):
-        names = [" - ".join(_atom_name(scene, int(i)) for i in bonds[k]) for k in broken]
+        residue = scene.residue_of_atom
+        label = [f"{scene.residue_names[r]} {scene.residue_ids[r]} {a}" for a, r in zip(scene.atom_names, residue)]
+        names = [" - ".join(label[i] for i in bonds[k]) for k in broken]
         raise PreparationError(
             f"{scene.name}: minimising its energy breaks the bond {listed(names, 3)} ({10 * now[broken[0]]:.2f} Å), as "
             "atoms stand in each other there; correct the coordinates, or build the molecule anew."
@@ -84,11 +84,6 @@ def refuse_damaged(scene: Scene, minimised_nm: FloatArray) -> None:
             f"{scene.name}: when its energy is minimised {what}, as the geometry is broken there; correct the "
             "coordinates, or build the molecule anew."
         )
-
-
-def _atom_name(scene: Scene, i: int) -> str:
-    residue = scene.residue_of_atom[i]
-    return f"{scene.residue_names[residue]} {scene.residue_ids[residue]} {scene.atom_names[i]}"
 
 
 class Engine:
@@ -185,11 +180,8 @@ class Engine:
         return self._of_atoms(self._query(forces=True).getForces(asNumpy=True))
 
     def minimise(self, *, max_iterations: int = 0) -> float:
-        """Minimise in place (L-BFGS until converged when 0) and return the energy in kJ/mol.
-
-        Raises SimulationError when the energy is not finite, and PreparationError where quantum forces lead to another
-        molecule.
-        """
+        """Minimise in place (L-BFGS until converged when 0) and return the energy in kJ/mol. Raises SimulationError
+        when the energy is not finite, and PreparationError where quantum forces lead to another molecule."""
         import openmm
 
         # Without this the minimiser may search for ever.

@@ -63,11 +63,9 @@ class Labels:
 
 
 class Labeller:
-    """GFN2-xTB of one molecule. Use as a context manager or call `close`.
-
-    `n_rearranged` counts the states that were left out since they are another molecule.
-    Raises PreparationError for what GFN2-xTB refuses, and for a molecule whose minimum is another one.
-    """
+    """GFN2-xTB of one molecule. Use as a context manager or call `close`. `n_rearranged` counts the states that were
+    left out since they are another molecule. Raises PreparationError for what GFN2-xTB refuses, and for a molecule
+    whose minimum is another one."""
 
     def __init__(self, scene: Scene, *, workers: int | None = None) -> None:
         self.scene = scene
@@ -102,9 +100,9 @@ class Labeller:
         states = asked[np.array(same, dtype=bool)]
         self.n_rearranged += len(asked) - len(states)
         if self._pool is None:
-            answers = [_answer(self._potential, state) for state in states]
+            answers = [_answer(state, self._potential) for state in states]
         else:
-            answers = self._pool.map(_ask, states, chunksize=4)
+            answers = self._pool.map(_answer, states, chunksize=4)
         good = [(x, *answer) for x, answer in zip(states, answers, strict=True) if answer is not None]
         shape = (len(good), self.scene.n_atoms, 3)
         kept, energies, forces = ([row[part] for row in good] for part in range(3))
@@ -176,12 +174,9 @@ def _start(scene: dict[str, Any]) -> None:
     _worker = Potential(Scene.from_dict(scene))
 
 
-def _ask(state: FloatArray) -> tuple[float, FloatArray] | None:
-    assert _worker is not None
-    return _answer(_worker, state)
-
-
-def _answer(potential: Potential, state: FloatArray) -> tuple[float, FloatArray] | None:
+def _answer(state: FloatArray, own: Potential | None = None) -> tuple[float, FloatArray] | None:
+    potential = own or _worker
+    assert potential is not None
     try:
         return potential(state)
     except (PreparationError, SimulationError):

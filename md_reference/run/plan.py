@@ -32,11 +32,9 @@ _TIMED_S, _BATCH_S = 0.3, 0.02
 
 @dataclass(frozen=True)
 class Plan:
-    """A run before it starts, in one `line` and in `rows`; what was not measured is None.
-
-    `wall_s`: seconds for all replicas of the asked length, equilibration included, if the cores are free. `skipped`:
-    what a general MD program would do and this run does not, and why, or what it saves.
-    """
+    """A run before it starts, in one `line` and in `rows`; what was not measured is None. `wall_s`: seconds for all
+    replicas of the asked length, equilibration included, if the cores are free. `skipped`: what a general MD program
+    would do and this run does not, and why, or what it saves."""
 
     line: str
     rows: dict[str, str | int]
@@ -48,11 +46,9 @@ class Plan:
 
 
 def make_plan(scene: Scene, config: MDConfig, *, replicas: int = 1, timed: bool = True) -> Plan:
-    """Return the plan of a run with these settings; one whose `time_ps` is 0 has no length yet.
-
-    Steps are timed as planned and on the CPU platform, unless nothing is to be `timed`. Raises PreparationError (no
-    parameters), UnknownNameError (platform), SimulationError (the scene cannot be stepped).
-    """
+    """Return the plan of a run with these settings; one whose `time_ps` is 0 has no length yet. Steps are timed as
+    planned and on the CPU platform, unless nothing is to be `timed`. Raises PreparationError (no parameters),
+    UnknownNameError (platform), SimulationError (the scene cannot be stepped)."""
     config = resolved(scene, config)
     spec = config.force
     system = build_system(scene, spec)
@@ -178,10 +174,8 @@ def plan_line(
     scene: Scene, config: MDConfig, choice: PlatformChoice, *, step_s: float | None = None, replicas: int = 0
 ) -> str:
     """Return the plan in one line: what runs on what, what is left out, and how long it takes where that is known.
-
     `config`: `resolved`. `step_s`: seconds of a step; `replicas`: for how many the wall time is stated, 0 for no such
-    time.
-    """
+    time."""
     wall_s = _wall_s(config, replicas, step_s)
     spec = config.force
     threads = "1 thread" if choice.threads == 1 else f"{choice.threads} threads"

@@ -180,10 +180,10 @@ def simulate_replicas(
     scenes = [scene] * len(outs) if given is None else given
     if fresh and given is None and config.starts == "many" and len(outs) > 1:
         report_preparing(progress, 0.0)
-        starts = many_starts(scene, config, len(outs))
-        scenes = list(starts.scenes)
+        starts, found = many_starts(scene, config, len(outs))
+        scenes = list(starts)
         if announce is not None:
-            announce(starts.how)
+            announce(found)
     how: dict[str, Any] = {"resume": resume, "overwrite": overwrite, "choice": choice}
 
     def job(k: int) -> tuple[list[Scene], MDConfig, list[Path], dict[str, Any]]:

@@ -61,9 +61,8 @@ def summarise(
     n_dof: int,
 ) -> dict[str, Any]:  # fmt: skip
     """Return the summary of a run's frames, JSON-able: temperature and potential; drift in NVE; volume and density.
-
-    Frames without a value (written by an older version) are left out. `target` is the bath's temperature, None without.
-    """
+    Frames without a value (written by an older version) are left out. `target` is the bath's temperature, None
+    without."""
     known = {name: values[np.isfinite(values)] for name, values in scalars.items()}
     if not len(known.get("temperature_k", ())):
         return {}

@@ -7,7 +7,7 @@ bonds kept. All is a function of scene, forces, number and seed: what resumes be
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -34,19 +34,13 @@ _COOLING = 0.2
 _APART = 0.2
 _TURNED_PS, _STIFFNESS_KJ_MOL = 20.0, 300.0
 _PIECE = 500
+# A scene for each replica, and how they were found, in a few words.
+Starts = tuple[tuple[Scene, ...], str]
 _KEPT = NOT_FINITE | CHIRALITY | OMEGA | RING
 
 
-@dataclass(frozen=True, eq=False)
-class Starts:
-    """A scene for each replica, and how they were found, in a few words."""
-
-    scenes: tuple[Scene, ...]
-    how: str
-
-
 def many_starts(scene: Scene, conditions: Conditions, n: int, *, hot_ps: float = HOT_PS) -> Starts:
-    """Return `n` starts of a scene in different states, drawn with the seed of `conditions`.
+    """Return `n` starts of a scene in different states, drawn with the seed of `conditions`, and how they were found.
 
     They come from `hot_ps` at 500 K and a fifth of that at the bath's temperature, by SIMD replicas where these run the
     scene, else by OpenMM; at quantum level by GAFF2. In explicit water the solute is turned to the torsions that its
@@ -54,7 +48,7 @@ def many_starts(scene: Scene, conditions: Conditions, n: int, *, hot_ps: float =
     """
 
     def one(why: str) -> Starts:
-        return Starts((scene,) * n, f"all from one structure: {why}")
+        return (scene,) * n, f"all from one structure: {why}"
 
     if n == 1 or scene.interactions is not None:
         return one("one replica" if n == 1 else "a model system")
@@ -65,7 +59,7 @@ def many_starts(scene: Scene, conditions: Conditions, n: int, *, hot_ps: float =
     if scene.cell_nm is not None:
         dry = replace(dry, cell_nm=None)
     try:
-        spec = _hot_forces(dry, conditions.force)
+        spec = _hot_forces(conditions.force)
         frames, by = _hot(dry, replace(conditions, force=spec, ensemble="nvt"), n, hot_ps)
         if scene.cell_nm is not None:
             frames = _in_water(
@@ -74,7 +68,7 @@ def many_starts(scene: Scene, conditions: Conditions, n: int, *, hot_ps: float =
     except (PreparationError, SimulationError) as error:
         return one(str(error).rstrip("."))
     how = f"{n} starts: the structure given and, {by}, states after {hot_ps:.3g} ps at {HOT_K:g} K"
-    return Starts(_scenes(scene, frames), how + (", cooled" if scene.cell_nm is None else ", turned to in water"))
+    return _scenes(scene, frames), how + (", cooled" if scene.cell_nm is None else ", turned to in water")
 
 
 def frames_as_starts(
@@ -101,16 +95,14 @@ def frames_as_starts(
     if not found:
         raise SimulationError(f"none of {tried} frames of the rollout can be a start of MD")
     scenes = _scenes(scene, np.stack(found))
-    return Starts(
-        tuple(scenes[k % len(scenes)] for k in range(n)), f"{len(found)} starts: frames of the rollout, relaxed"
-    )
+    return tuple(scenes[k % len(scenes)] for k in range(n)), f"{len(found)} starts: frames of the rollout, relaxed"
 
 
 def _scenes(scene: Scene, frames_nm: FloatArray) -> tuple[Scene, ...]:
     return tuple(replace(scene, positions_nm=frame) for frame in frames_nm)
 
 
-def _hot_forces(dry: Scene, force: ForceFieldSpec) -> ForceFieldSpec:
+def _hot_forces(force: ForceFieldSpec) -> ForceFieldSpec:
     """Return the forces of hot MD: the run's own without its water, GAFF2 at quantum level."""
     if force.force_field == QUANTUM:
         return ForceFieldSpec("gaff2", "vacuum", force.hydrogen_mass_da)
@@ -129,12 +121,11 @@ def _hot(dry: Scene, conditions: Conditions, n: int, hot_ps: float) -> tuple[Flo
     geometry = geometry_from_scene(dry)
     try:
         batches, by = _by_simd(system, conditions, start, hot_ps), "by SIMD replicas"
-        first = next(batches)
+        batch = next(batches)
     except SimdUnavailableError:
         batches, by = _by_openmm(dry, system, on_cpu, start, hot_ps), "by OpenMM"
-        first = next(batches)
+        batch = next(batches)
     found = [start]
-    batch = first
     for _ in range(2 + 4 * n // n_replicas()):
         found += [x for x in batch if not check_frames(x, geometry)[0] & _KEPT]
         if len(found) >= n:

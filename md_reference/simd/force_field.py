@@ -177,7 +177,7 @@ class SimdReplicas:
             self._system.molecule,
             n_atoms=terms.n_solute,
             biases=self._biases,
-            work=aligned((int(self._program.work_floats(terms.n_solute if terms.born else 0)) + 16,)),
+            work=aligned((int(self._program.work_floats(terms.n_solute if terms.molecule["born"] else 0)) + 16,)),
             **terms.molecule,
         )
         if terms.cell_nm is not None:
@@ -310,15 +310,11 @@ class SimdReplicas:
             self._names[...] = np.arange(len(self._names))[:, None]
             self._images[...] = 0
         self._place(given)
-        if self.cell_nm is not None:
-            self._choose_sites()
-
-    def _choose_sites(self) -> None:
-        """Let the places of waters be those of the first replica."""
-        n = len(self._sites)
-        hydrogens = self._positions[self.n_atoms - 3 * n :, :, 0].reshape(n, 3, 3)[:, 1:]
-        self._sites[...] = hydrogens.mean(axis=1)
-        self._list_neighbours()
+        if self.cell_nm is not None:  # the places of waters are those of the first replica
+            n = len(self._sites)
+            hydrogens = self._positions[self.n_atoms - 3 * n :, :, 0].reshape(n, 3, 3)[:, 1:]
+            self._sites[...] = hydrogens.mean(axis=1)
+            self._list_neighbours()
 
     def _list_neighbours(self) -> None:
         assert self.cell_nm is not None

@@ -35,11 +35,9 @@ class SimdUnavailableError(SimulationError):
 
 @dataclass
 class Terms:
-    """The System in the program's order: `order` (n_atoms,) has the solute first, then waters as O, H, H.
-
-    `rigid` (n, 2) bonds outside water with their `lengths` (n,) nm; the other fields hold what the program's structures
-    of these names do.
-    """
+    """The System in the program's order: `order` (n_atoms,) has the solute first, then waters as O, H, H. `rigid` (n,
+    2) bonds outside water with their `lengths` (n,) nm; the other fields hold what the program's structures of these
+    names do."""
 
     order: IntArray
     n_solute: int
@@ -55,10 +53,6 @@ class Terms:
     units: IntArray = field(default_factory=lambda: np.zeros((0, 2), np.int64))
     middles_nm: float = 0.0
     constant_kj_mol: float = 0.0
-
-    @property
-    def born(self) -> bool:
-        return bool(self.molecule["born"])
 
 
 def read_terms(system: Any, biased: Sequence[Sequence[int]], width: int) -> Terms:

@@ -319,13 +319,17 @@ def reference(scene: SceneArg, *, out: OutOpt, options: ReferenceOptions, as_jso
     print_written(sm.reference(scene, out, options=options), as_json, options.quiet)
 
 
-_CAMPAIGN = """An example of FILE, of two scenes at two temperatures (every setting of `reference` may stand in it):\n
-scenes = ["alanine-dipeptide", "pdb/*.pdb"]\n temperatures = ["300K", "350K"]\n replicas = 4\n time = "100ns"\n
-save_every = "10ps"
-"""
+_CAMPAIGN = (
+    "An example of FILE, of two scenes at two temperatures (every setting of `reference` may stand in it):",
+    'scenes = ["alanine-dipeptide", "pdb/*.pdb"]',
+    'temperatures = ["300K", "350K"]',
+    "replicas = 4",
+    'time = "100ns"',
+    'save_every = "10ps"',
+)
 
 
-@app.command(epilog=literal(_CAMPAIGN))
+@app.command(epilog=literal("\n\n".join(_CAMPAIGN)))
 @with_options
 def campaign(
     file: Annotated[

@@ -1,11 +1,12 @@
-"""A surrogate behind the face of `openmm.app.Simulation`: topology, reporters, step, context; and a learned potential
-as other programs take it."""
+"""A surrogate behind the face of `openmm.app.Simulation`: topology, reporters, step, context, checkpoints; and
+a learned potential as other programs take it."""
 
 from __future__ import annotations
 
+import io
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any, BinaryIO, NoReturn
 
 import numpy as np
 import numpy.typing as npt
@@ -18,7 +19,9 @@ from surrogate.models.weights import Weights, load_weights
 from surrogate.sampling.chunks import ChunkSampler, noise_seed
 from surrogate.sampling.config import RolloutConfig
 from surrogate.sampling.domain import fit_weights, match_domain
-from systems.errors import InputError, SimulationError
+from systems.errors import InputError, SimulationError, first_line
+from systems.files.outside import UNREADABLE, arrays_in
+from systems.files.whole_file import create_whole
 from systems.library.named_scenes import prepare
 from systems.options import from_field, options_as_keywords
 from systems.scene import Scene
@@ -194,6 +197,46 @@ class Simulation:
             for reporter, steps in zip(self.reporters, due, strict=True):
                 if steps == ahead:
                     reporter.report(self, self.state())
+
+    def saveCheckpoint(self, file: str | Path | BinaryIO) -> None:
+        """Write where the simulation stands to a path or a binary file, all random numbers to come included."""
+        arrays = {"last": self._last, "current": self._current, "pending": self._pending, "centre": self._centre}
+        if self._velocities is not None:
+            arrays["velocities"] = self._velocities
+        arrays["counts"] = np.array([self.currentStep, self._chunks, self._frames])
+        buffer = io.BytesIO()
+        np.savez(buffer, allow_pickle=False, settings=np.array(self._settings()), **arrays)
+        if isinstance(file, str | Path):
+            create_whole(Path(file), buffer.getvalue())
+        else:
+            file.write(buffer.getvalue())
+
+    def loadCheckpoint(self, file: str | Path | BinaryIO) -> None:
+        """Go back to where a checkpoint was saved; what follows is the same bit for bit.
+
+        Raises InputError when it is damaged, or of another scene, other weights or settings; nothing changes then.
+        """
+        name = str(file) if isinstance(file, str | Path) else "the checkpoint"
+        try:
+            arrays = arrays_in(file)
+            settings, counts = arrays["settings"].tolist(), arrays["counts"].tolist()
+            last, current, pending, centre = (arrays[key] for key in ("last", "current", "pending", "centre"))
+        except UNREADABLE as error:
+            raise InputError(f"{name} cannot be read as a checkpoint ({first_line(error)}); take another.") from error
+        if differs := [f"{a}, not {b}" for a, b in zip(settings, self._settings(), strict=True) if a != b]:
+            raise InputError(f"{name} was saved with {differs[0]}.")
+        self._last, self._current, self._pending, self._centre = last, current, pending, centre
+        self._velocities = arrays.get("velocities")
+        self.currentStep, self._chunks, self._frames = counts
+
+    def _settings(self) -> list[str]:
+        """Return what a checkpoint must have been saved with, a text each."""
+        sampler = self._sampler
+        return [
+            f"seed = {self._seed}", f"lag_ps = {self.lag_ps}", f"weights {self.weights.hash}",
+            f"topology {self.scene.topology_hash}", f"solver = {sampler.solver!r}, {sampler.solver_steps} steps",
+            f"precision = {sampler.precision.name}",
+        ]  # fmt: skip
 
     minimizeEnergy = _lacks("energy to minimise; prepare the scene, or minimise it with OpenMM")
 

@@ -52,12 +52,6 @@ _UNUSUAL = {frozenset("NO"): 0.0, frozenset("CO"): 0.02, frozenset("CN"): 0.03, 
 _HYDROGEN_ON_CATION = -0.02
 
 
-def is_usual(elements: Sequence[str], neighbours: Sequence[Sequence[int]], i: int, valence: int, charge: int) -> bool:
-    """Whether atom `i` may have this valence and charge without a doubt: a state of the table, no anion of nitrogen."""
-    known = any(s[:2] == (valence, charge) for s in _ANY.get(elements[i], {}).get(len(neighbours[i]), ()))
-    return known and not (elements[i] == "N" and charge < 0)
-
-
 def lewis_structure(
     elements: Sequence[str],
     bonds: npt.NDArray[np.int64],
@@ -225,6 +219,8 @@ _VALENCE = {"H": 1, "B": 3, "C": 4, "N": 3, "O": 2, "F": 1, "Si": 4, "P": 3, "S"
 _IONS = {"Li": 1, "Na": 1, "K": 1, "Rb": 1, "Cs": 1, "Mg": 2, "Ca": 2, "Sr": 2, "Ba": 2, "Zn": 2, "F": -1, "Cl": -1,
          "Br": -1, "I": -1, "Cu": 2, "Fe": 2, "Mn": 2, "Co": 2, "Ni": 2, "Cd": 2}  # fmt: skip
 
+# Which double bonds come first, where valences are open; 7 of other ones to oxygen, else 5.
+_PREFERENCES = {frozenset("CO"): 9, frozenset("CN"): 6, frozenset("CS"): 4}
 # |triple product| of three unit vectors (0.77 in a tetrahedron), and the cosine between two (-0.5 at 120 degrees).
 _FLAT = 0.55
 _STRAIGHT = -0.8
@@ -260,16 +256,17 @@ def perceive(
     orders, charges, bad = found.orders, found.charges, found.bad
     valence = np.zeros(len(elements))
     np.add.at(valence, bonds.ravel(), np.repeat(orders, 2))
-    doubtful = set(bad) | {
-        i
-        for i, q in enumerate(charges.tolist())
-        if neighbours[i] and not is_usual(elements, neighbours, i, round(valence[i]), q)
-    }
+    doubtful = set(bad)
+    for i, q in enumerate(charges.tolist()):
+        usual = {s[:2] for s in _ANY.get(elements[i], {}).get(len(neighbours[i]), ())}
+        if neighbours[i] and ((round(valence[i]), q) not in usual or (elements[i] == "N" and q < 0)):
+            doubtful.add(i)
     if positions_nm is not None:
         cations = [i for i in np.flatnonzero((charges > 0) & (valence == 4)).tolist() if elements[i] == "N"]
         double = [k for k, order in enumerate(orders) if order > 1 and all(elements[i] == "C" for i in bonds[k])]
         doubted = [*(j for i in cations for j in neighbours[i]), *bonds[double].ravel().tolist()]
-        _refuse_bent(elements, neighbours, set(doubted) - set(trusted), positions_nm)
+        if bent := bent_carbons(elements, neighbours, set(doubted) - set(trusted), positions_nm):
+            raise ValenceError(bent)
     if not doubtful:
         return orders, charges
     graph = nx.Graph(bonds.tolist())
@@ -288,8 +285,9 @@ def perceive(
                 better = None  # it may be an anion as well as a cation, or miss a hydrogen
         if better is None:
             raise ValenceError(sorted(molecule & set(bad)) or sorted(molecule & doubtful))
-        if positions_nm is not None:
-            _refuse_bent(elements, neighbours, molecule - set(trusted), positions_nm)
+        checked = molecule - set(trusted)
+        if positions_nm is not None and (bent := bent_carbons(elements, neighbours, checked, positions_nm)):
+            raise ValenceError(bent)
         orders[rows], charges[atoms] = better
     return orders, charges
 
@@ -329,17 +327,6 @@ def _has_lone_carbon_ion(
 
     charged = (i for i, q in zip(atoms, charges.tolist(), strict=True) if q and elements[i] == "C")
     return any(all(is_saturated(j) for j in neighbours[i]) for i in charged)
-
-
-def _refuse_bent(
-    elements: Sequence[str],
-    neighbours: Sequence[Sequence[int]],
-    atoms: Collection[int],
-    positions_nm: npt.NDArray[np.float64],
-) -> None:
-    bent = bent_carbons(elements, neighbours, atoms, positions_nm)
-    if bent:
-        raise ValenceError(bent)
 
 
 class _Kekule:
@@ -420,7 +407,8 @@ class _Kekule:
             graph = nx.Graph()
             for i, j in self.order:
                 if self._open[i] > 0 and self._open[j] > 0:
-                    graph.add_edge(i, j, weight=_preference(self._elements[i], self._elements[j]))
+                    pair = frozenset((self._elements[i], self._elements[j]))
+                    graph.add_edge(i, j, weight=_PREFERENCES.get(pair, 7 if "O" in pair else 5))
             pairs = nx.max_weight_matching(graph, maxcardinality=True)
             if not pairs:
                 break
@@ -447,16 +435,3 @@ class _Kekule:
     def _is_donor(self, j: int) -> bool:
         saturated = len(self._neighbours[j]) == 3 and self._open[j] == 0
         return self._elements[j] == "N" and self.charges[j] == 0 and saturated
-
-
-def _preference(one: str, other: str) -> int:
-    pair = {one, other}
-    if pair == {"C", "O"}:
-        return 9
-    if "O" in pair:
-        return 7
-    if pair == {"C", "N"}:
-        return 6
-    if pair == {"C", "S"}:
-        return 4
-    return 5

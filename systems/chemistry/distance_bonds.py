@@ -21,12 +21,17 @@ from systems.scene import PARTICLE, FloatArray, IntArray, Scene
 _TOLERANCE_NM = 0.04
 # A bond longer than so many sums of covalent radii is none.
 _BOND_STRETCH = 1.3
+# More than any bond is longer than the sum of radii.
+_SLACK_NM = 0.1
 
 
 def with_bonds_by_distance(scene: Scene, cell_nm: npt.ArrayLike | None = None) -> Scene:
     """Return the scene with bonds for residues that hold an atom without any, else as it is: two atoms are bonded when
     they, or images of theirs in the cell `(3, 3)` nm (rows a, b, c), are nearer than the sum of their covalent radii
-    and 0.04 nm. Ions, rare gases and virtual sites stay alone."""
+    and 0.04 nm. Ions, rare gases and virtual sites stay alone. Where residues stand in pieces, because a file's atoms
+    are shuffled, every atom is looked at, and impossibly long bonds that other programs made of the pieces go."""
+    if scene.positions_nm.any() and _are_in_pieces(scene):
+        return _all_by_distance(scene)
     virtual = np.array([e == PARTICLE for e in scene.elements])
     bonded = virtual.copy()
     bonded[scene.bonds.ravel()] = True
@@ -37,8 +42,35 @@ def with_bonds_by_distance(scene: Scene, cell_nm: npt.ArrayLike | None = None) -
         return scene
     atoms = np.flatnonzero(np.isin(residue, open_residues) & ~virtual)
     found = bonds_by_distance([scene.elements[i] for i in atoms], scene.positions_nm[atoms], cell_nm)
+    return _with_more(scene, atoms[found])
+
+
+def _are_in_pieces(scene: Scene) -> bool:
+    """Whether a residue comes back after another one with other atoms; with the same ones it is a copy."""
+    names: dict[tuple[str, str, str], list[set[str]]] = {}
+    pieces: list[set[str]] = [set() for _ in scene.residue_names]
+    for name, r in zip(scene.atom_names, scene.residue_of_atom.tolist(), strict=True):
+        pieces[r].add(name)
+    for key, piece in zip(zip(scene.chain_of_residue, scene.residue_ids, scene.residue_names), pieces, strict=True):
+        names.setdefault(key, []).append(piece)
+    return any(len(own) > 1 and sum(map(len, own)) == len(set().union(*own)) for own in names.values())
+
+
+def _all_by_distance(scene: Scene) -> Scene:
+    i, j = scene.bonds.T
+    length = np.linalg.norm(scene.positions_nm[i] - scene.positions_nm[j], axis=1)
+    radii = np.array([0.0 if e == PARTICLE else covalent_radius_nm(e) for e in scene.elements])
+    good = length < radii[i] + radii[j] + _SLACK_NM
+    # Orders and charges that were perceived in wrong bonds are none.
+    nothing = np.zeros(int(good.sum())), np.zeros_like(scene.formal_charges)
+    kept = replace(scene, bonds=scene.bonds[good], bond_orders=nothing[0], formal_charges=nothing[1])
+    atoms = np.flatnonzero([not is_metal(e) and e != PARTICLE for e in scene.elements])
+    return _with_more(kept, atoms[bonds_by_distance([scene.elements[k] for k in atoms], scene.positions_nm[atoms])])
+
+
+def _with_more(scene: Scene, found: IntArray) -> Scene:
     order_of = dict(zip(map(tuple, scene.bonds.tolist()), scene.bond_orders.tolist(), strict=True))
-    order_of = dict.fromkeys(map(tuple, atoms[found].tolist()), 0.0) | order_of
+    order_of = dict.fromkeys(map(tuple, found.tolist()), 0.0) | order_of
     rows = sorted(order_of)
     return replace(
         scene,
@@ -129,10 +161,8 @@ _DENSEST_PER_NM3 = 250.0
 
 
 def lengths_and_angles(cell_nm: npt.ArrayLike) -> tuple[FloatArray, FloatArray]:
-    """Return `(lengths (n, 3) nm, angles (n, 3) degrees)` of box vectors `(n, 3, 3)` nm (rows a, b, c).
-
-    Angles are alpha (between b and c), beta (a and c) and gamma (a and b).
-    """
+    """Return `(lengths (n, 3) nm, angles (n, 3) degrees)` of box vectors `(n, 3, 3)` nm (rows a, b, c). Angles are
+    alpha (between b and c), beta (a and c) and gamma (a and b)."""
     cell = np.asarray(cell_nm, dtype=np.float64)
     lengths = np.linalg.norm(cell, axis=2)
     unit = cell / lengths[:, :, None]

@@ -5,7 +5,7 @@ from __future__ import annotations
 from functools import cache
 from typing import Any
 
-from systems.chemistry.residues import template_for
+from systems.chemistry.residues import NAMES, template_for
 from systems.interrupts import deferred_interrupt
 from systems.scene import ATOMIC_NUMBERS
 
@@ -25,9 +25,6 @@ _WEIGHTS_DA = {
 _RADII_NM = {"C": 0.076, "Mn": 0.150, "Fe": 0.142, "Co": 0.138}
 # Elements whose names are seldom the beginning of another atom's: these are also known by an atom's name alone.
 _COMMON = frozenset(_WEIGHTS_DA)
-# Names of ions that are not their element's: CHARMM's, and those of the Protein Data Bank.
-_ION_NAMES = {"SOD": "Na", "POT": "K", "CLA": "Cl", "CAL": "Ca", "CES": "Cs", "LIT": "Li", "RUB": "Rb",
-              "BAR": "Ba", "CAD": "Cd", "IOD": "I", "BRO": "Br", "CU1": "Cu", "3CO": "Co", "3NI": "Ni"}  # fmt: skip
 _ANY_ION = ("ION", "IONS", "IO", "CIO", "IP", "IM", "CIP", "CIM")
 _HALOGENS = ("F", "Cl", "Br", "I")
 _UNNAMED_RESIDUES = ("UNL", "UNK", "LIG", "MOL", "DRG")
@@ -44,19 +41,14 @@ def covalent_radius_nm(symbol: str) -> float:
     return _RADII_NM.get(symbol) or round(_element(symbol).covalent_r / 10.0, 4)
 
 
-def is_element(symbol: str) -> bool:
-    """Whether this is the symbol of a chemical element."""
-    return symbol in ATOMIC_NUMBERS
-
-
 def is_metal(symbol: str) -> bool:
     """Whether this is the symbol of a metal."""
-    return is_element(symbol) and bool(_element(symbol).is_metal)
+    return symbol in ATOMIC_NUMBERS and bool(_element(symbol).is_metal)
 
 
 @cache
 def _element(symbol: str) -> Any:
-    if not is_element(symbol):
+    if symbol not in ATOMIC_NUMBERS:
         raise KeyError(symbol)
     # A Ctrl-C while gemmi is imported would abort the process.
     with deferred_interrupt() as asked:
@@ -75,7 +67,7 @@ def ion_symbol(name: str) -> str | None:
     """Return the element of a monatomic ion by its name (`SOD`, `Na+`, `CL-`, `ZN2`, `MG`), or None."""
     upper = name.strip().upper()
     bare = upper.rstrip("+-").rstrip("0123456789").rstrip("+-") or upper
-    symbol = _ION_NAMES.get(upper, bare.capitalize())
+    symbol = NAMES["ions"].get(upper, bare.capitalize())
     return symbol if symbol in _COMMON and is_lone_ion(symbol) else None
 
 
@@ -121,6 +113,6 @@ def element_symbol(name_field: str, residue_name: str, written: str, *, hetero: 
 def _is_stated(symbol: str, name_field: str) -> bool:
     """Whether an element column is believed. A rare element whose symbol also begins a usual name (HO: holmium, or the
     hydrogen HO2 of a program that fills the column with names) must be the atom's whole name."""
-    if symbol in _COMMON or not is_element(symbol):
+    if symbol in _COMMON or symbol not in ATOMIC_NUMBERS:
         return symbol in _COMMON
     return name_field.strip().upper() == symbol.upper() or symbol[0] not in "BCFHNOPS"

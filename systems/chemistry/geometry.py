@@ -19,33 +19,20 @@ FloatArray = npt.NDArray[np.floating[Any]]
 
 # Up to so many points all pairs are looked at: sooner done than the library of trees is imported.
 _FEW_POINTS = 300
-_NEWTON_STEPS = 60
-_DEGENERATE = 1e-5
 
 
 def torsion(positions_nm: npt.ArrayLike, quads: npt.ArrayLike) -> FloatArray:
     """Return torsion angles `(n_frames, k)` in [-pi, pi], positive by the IUPAC convention (1970, rule 1.2).
-
     `positions_nm (n_frames, n_atoms, 3)` or one frame `(n_atoms, 3)` (then the result is `(k,)`), `quads (k, 4)`.
-    Computed in the dtype given, float32 or float64. Raises InputError for arrays of another shape.
-    """
+    Computed in the dtype given, float32 or float64. Raises InputError for arrays of another shape."""
     x, single = _frames(positions_nm)
-    idx = np.asarray(quads, dtype=np.int64).reshape(-1, 4)
-    a, b, c, d = (x[:, idx[:, k]] for k in range(4))
-    middle = c - b
-    first = np.cross(b - a, middle)
-    second = np.cross(middle, d - c)
-    sine = np.einsum("nkx,nkx->nk", b - a, second) * np.linalg.norm(middle, axis=-1)
-    cosine = np.einsum("nkx,nkx->nk", first, second)
-    angles: FloatArray = np.arctan2(sine, cosine)
+    angles = torsion_angle(x.transpose(2, 1, 0), np.asarray(quads, dtype=np.int64).reshape(-1, 4)).T
     return angles[0] if single else angles
 
 
 def near_pairs(points: npt.ArrayLike, reach: float, what: str = "") -> npt.NDArray[np.int64]:
     """Return the pairs i < j `(n, 2)` of points `(n_points, 3)` nearer to each other than `reach`, in ascending order.
-
-    Raises PreparationError, which names `what`, where they stand so close that atoms must coincide.
-    """
+    Raises PreparationError, which names `what`, where they stand so close that atoms must coincide."""
     x = np.asarray(points, dtype=np.float64).reshape(-1, 3)
     if len(x) <= _FEW_POINTS:
         i, j = np.triu_indices(len(x), 1)
@@ -63,10 +50,7 @@ def signed_volumes(positions_nm: npt.ArrayLike, quads: npt.ArrayLike) -> FloatAr
     """Return the signed volumes `(n_frames, k)` nm^3 of (b-a) x (c-a) . (d-a) for quadruples (a, b, c, d) `(k, 4)`; one
     frame `(n_atoms, 3)` gives `(k,)`. For a stereocentre `a` with neighbours b, c, d the sign is its handedness."""
     x, single = _frames(positions_nm)
-    idx = np.asarray(quads, dtype=np.int64).reshape(-1, 4)
-    origin = x[:, idx[:, 0]]
-    b, c, d = (x[:, idx[:, k]] - origin for k in (1, 2, 3))
-    volumes: FloatArray = np.einsum("nkx,nkx->nk", np.cross(b, c), d)
+    volumes = signed_volume(x.transpose(2, 1, 0), np.asarray(quads, dtype=np.int64).reshape(-1, 4)).T
     return volumes[0] if single else volumes
 
 
@@ -102,9 +86,8 @@ def superposition(
 
     A frame x moves to `x @ R.T + t`. `positions_nm (n, n_atoms, 3)`, `template_nm (n_atoms, 3)`; `idx` selects the
     atoms that are fitted, `weights` weighs those. Rotations are proper: a mirror image stays one. Where the best
-    rotation is not unique one of the best is returned. Source: quaternion form of Horn (1987) with the characteristic
-    polynomial solved by Newton's method as in Theobald, Acta Cryst. A61, 478 (2005); near-degenerate frames by
-    diagonalisation. Raises InputError for shapes that do not fit or weights that are negative or all zero.
+    rotation is not unique one of the best is returned. Source: quaternions of Horn, J. Opt. Soc. Am. A 4, 629 (1987).
+    Raises InputError for shapes that do not fit or weights that are negative or all zero.
     """
     x, _ = _frames(positions_nm)
     y = np.asarray(template_nm, dtype=np.float64)
@@ -161,9 +144,7 @@ def _frames(positions_nm: npt.ArrayLike) -> tuple[FloatArray, bool]:
 
 def _best_rotations(covariance: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
     """Rotations maximising tr(R S) for S = sum_a w_a x_a y_a^T, `(n, 3, 3)`."""
-    # Each S is brought to unit scale first, so that one threshold tells degenerate frames from good ones.
-    scale = np.sqrt(np.einsum("nij,nij->n", covariance, covariance))
-    s = covariance / np.where(scale > 0, scale, 1.0)[:, None, None]
+    s = covariance
     key = np.empty((len(s), 4, 4))
     key[:, 0, 0] = s[:, 0, 0] + s[:, 1, 1] + s[:, 2, 2]
     key[:, 1, 1] = s[:, 0, 0] - s[:, 1, 1] - s[:, 2, 2]
@@ -175,7 +156,9 @@ def _best_rotations(covariance: npt.NDArray[np.float64]) -> npt.NDArray[np.float
     key[:, 1, 2] = key[:, 2, 1] = s[:, 0, 1] + s[:, 1, 0]
     key[:, 1, 3] = key[:, 3, 1] = s[:, 0, 2] + s[:, 2, 0]
     key[:, 2, 3] = key[:, 3, 2] = s[:, 1, 2] + s[:, 2, 1]
-    quaternion = _top_eigenvectors(key, s)
+    quaternion = np.full((len(s), 4), np.nan)
+    finite = np.isfinite(key).all(axis=(1, 2))
+    quaternion[finite] = np.linalg.eigh(key[finite])[1][:, :, -1]  # of the largest eigenvalue
     w, x, y, z = quaternion.T
     rotation = np.empty((len(s), 3, 3))
     rotation[:, 0, 0] = 1 - 2 * (y * y + z * z)
@@ -185,40 +168,6 @@ def _best_rotations(covariance: npt.NDArray[np.float64]) -> npt.NDArray[np.float
     rotation[:, 0, 2], rotation[:, 2, 0] = 2 * (x * z + w * y), 2 * (x * z - w * y)
     rotation[:, 1, 2], rotation[:, 2, 1] = 2 * (y * z - w * x), 2 * (y * z + w * x)
     return rotation
-
-
-def _top_eigenvectors(key: npt.NDArray[np.float64], s: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
-    """Unit eigenvectors `(n, 4)` of the largest eigenvalue of traceless symmetric `key (n, 4, 4)`."""
-    c2 = -2.0 * np.einsum("nij,nij->n", s, s)
-    with np.errstate(invalid="ignore"):  # frames with NaN stay NaN
-        c1 = -8.0 * np.linalg.det(s)
-        c0 = np.linalg.det(key)
-    root = np.full(len(s), np.sqrt(3.0) + 1e-9)  # an upper bound at unit scale: Newton then falls monotonically
-    for _ in range(_NEWTON_STEPS):
-        value = ((root * root + c2) * root + c1) * root + c0
-        slope = (4.0 * root * root + 2.0 * c2) * root + c1
-        step = np.where(slope > 0, value / np.where(slope > 0, slope, 1.0), 0.0)
-        root = root - step
-        if np.abs(step).max(initial=0.0) < 1e-15:
-            break
-    # P(K) / (K - root) by Horner's rule: every column is the wanted eigenvector, times a factor.
-    eye = np.eye(4)
-    columns = key + root[:, None, None] * eye
-    columns = columns @ key + (root * root + c2)[:, None, None] * eye
-    columns = columns @ key + ((root * root + c2) * root + c1)[:, None, None] * eye
-    norms = np.sqrt(np.einsum("nij,nij->nj", columns, columns))
-    best = norms.argmax(axis=1)
-    rows = np.arange(len(s))
-    length = norms[rows, best]
-    bad = ~(length > _DEGENERATE)
-    vector = columns[rows, :, best] / np.where(bad, 1.0, length)[:, None]
-    if bad.any():
-        finite = np.isfinite(key[bad]).all(axis=(1, 2))
-        solved = np.full((int(bad.sum()), 4), np.nan)
-        if finite.any():
-            solved[finite] = np.linalg.eigh(key[bad][finite])[1][:, :, -1]
-        vector[bad] = solved
-    return vector
 
 
 # ---- many frames at once, frames last in memory ---------------------------------------------------------------------

@@ -32,10 +32,8 @@ _CLASH_NM = 0.14
 
 @dataclass(frozen=True)
 class AtomClasses:
-    """Canonical colours `(n_atoms,)`, equal for equivalent atoms, and the stereocentres they reveal.
-
-    `centres`: rows (centre, a, b, c), neighbours by falling colour, hydrogen last, the fourth left out.
-    """
+    """Canonical colours `(n_atoms,)`, equal for equivalent atoms, and the stereocentres they reveal. `centres`: rows
+    (centre, a, b, c), neighbours by falling colour, hydrogen last, the fourth left out."""
 
     colours: tuple[int, ...]
     centres: tuple[tuple[int, int, int, int], ...]
@@ -60,9 +58,7 @@ def bonded_graph(scene: Scene) -> nx.Graph:
 @once_per_scene
 def classify(scene: Scene, *, stereo: bool = True, mirrored: bool = False) -> AtomClasses:
     """Return the classes of a scene's atoms; `mirrored` classifies its mirror image, `stereo=False` connectivity only.
-
-    Bond orders and atomic charges are left out: programs differ in them for one and the same molecule.
-    """
+    Bond orders and atomic charges are left out: programs differ in them for one and the same molecule."""
     graph = bonded_graph(scene)
     rings = ring_sizes(graph)
     neighbours = scene.neighbours()
@@ -182,10 +178,8 @@ def _lone_cycles(rings: dict[tuple[int, int], int]) -> list[list[int]]:
 def _ring_relations(
     positions_nm: FloatArray, neighbours: list[list[int]], colours: list[int], cycle: list[int], known: set[int]
 ) -> dict[int, list[tuple[int, int, int]]]:
-    """Cis and trans on rings whose two directions are alike (1,4-dimethylcyclohexane), which hold no stereocentre.
-
-    The sign of (previous, next, higher substituent) changes with the direction of the walk; products of two do not.
-    """
+    """Cis and trans on rings whose two directions are alike (1,4-dimethylcyclohexane), which hold no stereocentre. The
+    sign of (previous, next, higher substituent) changes with the direction of the walk; products of two do not."""
     n = len(cycle)
     signs: dict[int, int] = {}
     for k, atom in enumerate(cycle):
@@ -210,11 +204,9 @@ def _ring_relations(
 
 @once_per_scene
 def molecule_key(scene: Scene) -> str:
-    """Return a hash of elements, connectivity, total charge and stereo, 16 hexadecimal digits.
-
-    Free of atom order, names, positions, bond orders and the atom a charge is drawn on; enantiomers, diastereomers and
-    E/Z isomers differ. Of a model system it is a hash of the law, particle by particle.
-    """
+    """Return a hash of elements, connectivity, total charge and stereo, 16 hexadecimal digits. Free of atom order,
+    names, positions, bond orders and the atom a charge is drawn on; enantiomers, diastereomers and E/Z isomers differ.
+    Of a model system it is a hash of the law, particle by particle."""
     record: tuple[object, ...] = (classify(scene).fingerprint, int(scene.formal_charges.sum()))
     if scene.interactions is not None:
         record = (*record, json.dumps(scene.interactions, sort_keys=True), scene.masses_da.tolist())
@@ -224,9 +216,7 @@ def molecule_key(scene: Scene) -> str:
 @once_per_scene
 def atom_classes(scene: Scene) -> IntArray:
     """Return a class number per atom `(n_atoms,)`: equal for atoms that connectivity and stereo do not tell apart.
-
-    Numbers run from 0 in an order that is canonical for the molecule.
-    """
+    Numbers run from 0 in an order that is canonical for the molecule."""
     colours = classify(scene).colours
     rank = {c: k for k, c in enumerate(sorted(set(colours)))}
     return np.array([rank[c] for c in colours], dtype=np.int64)
@@ -249,11 +239,9 @@ def ring_bonds(scene: Scene) -> IntArray:
 
 
 def backbone_torsions(scene: Scene) -> dict[str, IntArray]:
-    """Return the peptide torsions `phi`, `psi`, `omega`, each `(k, 4)`, ordered along the chain.
-
-    Found from the graph: C(=O)-N-CA-C(=O) and N-CA-C(=O)-N, with omega (X, C, N, Y) about every C(=O)-N bond between
-    carbons (caps included). CA has no multiple bond in a ring: caffeine and picolinamide are no peptides.
-    """
+    """Return the peptide torsions `phi`, `psi`, `omega`, each `(k, 4)`, ordered along the chain. Found from the graph:
+    C(=O)-N-CA-C(=O) and N-CA-C(=O)-N, with omega (X, C, N, Y) about every C(=O)-N bond between carbons (caps included).
+    CA has no multiple bond in a ring: caffeine and picolinamide are no peptides."""
     graph = bonded_graph(scene)
     symbol = scene.elements
 

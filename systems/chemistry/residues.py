@@ -8,11 +8,12 @@ from __future__ import annotations
 
 import gzip
 import re
+import tomllib
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, replace
 from functools import cache
 from importlib.resources import files
-from typing import cast
+from typing import Any, cast
 
 import networkx as nx
 
@@ -33,24 +34,9 @@ _WRITTEN: dict[str, tuple[str, str]] = {
         "CA1 CB2 CD11 NE11 CE31 CZ31 CH21 CZ21",
     ),
 }
-_RESIDUE_ALIASES = {
-    "HID": "HIS", "HIE": "HIS", "HIP": "HIS", "HSD": "HIS", "HSE": "HIS", "HSP": "HIS", "HISD": "HIS", "HISE": "HIS",
-    "HISH": "HIS", "HISA": "HIS", "HISB": "HIS", "HIS1": "HIS", "HIS2": "HIS", "ASH": "ASP", "ASPH": "ASP",
-    "ASPP": "ASP", "GLH": "GLU", "GLUH": "GLU", "GLUP": "GLU", "LYN": "LYS", "LYSH": "LYS", "LYP": "LYS", "LSN": "LYS",
-    "CYX": "CYS", "CYM": "CYS", "CYS2": "CYS", "CYSH": "CYS", "CYN": "CYS", "NMA": "NME", "CBX": "NME", "NHE": "NH2",
-}  # fmt: skip
-_ATOM_ALIASES: dict[str, dict[str, str]] = {
-    "ILE": {"CD": "CD1"},
-    "ACE": {"CA": "CH3", "CAY": "CH3", "CY": "C", "OY": "O"},
-    "NME": {"CH3": "C", "CA": "C", "CAT": "C", "CT": "C", "NT": "N"},
-    "NH2": {"NT": "N"},
-}
-_TERMINAL_ALIASES = {"OT1": "O", "OC1": "O", "O1": "O", "OT2": "OXT", "OC2": "OXT", "O2": "OXT", "OT": "OXT"}
-_WATERS = {
-    "HOH", "WAT", "H2O", "DOD", "D2O", "SOL", "SPC", "SPCE", "TIP", "TIP3", "TIP4", "TIP5", "TIP3P", "TIP4P", "TIP5P",
-    "TP3", "TP4", "TP5", "T3P", "T4P", "T5P", "T3H", "T4H", "T4E", "TP3M", "OPC", "OPC3", "SWM", "SWM4", "SWM6", "HHO",
-    "OHH", "OH2", "W", "WATER",
-}  # fmt: skip
+# What other programs call residues and atoms, and names of water, of ions and of what stands beside a molecule.
+NAMES: dict[str, Any] = tomllib.loads((files("systems.library") / "data" / "names.toml").read_text())
+_RESIDUE_ALIASES = {alias: name for name, aliases in NAMES["residues"].items() for alias in aliases}
 ONE_LETTER = {
     "A": "ALA", "R": "ARG", "N": "ASN", "D": "ASP", "C": "CYS", "Q": "GLN", "E": "GLU", "G": "GLY", "H": "HIS",
     "I": "ILE", "L": "LEU", "K": "LYS", "M": "MET", "F": "PHE", "P": "PRO", "S": "SER", "T": "THR", "W": "TRP",
@@ -85,11 +71,11 @@ def template_for(residue_name: str) -> ResidueTemplate | None:
 def canonical_heavy_name(template: ResidueTemplate, name: str) -> str | None:
     """Return the template's name of a heavy atom (`OXT` included), or None when it has no such atom."""
     upper = name.upper()
-    upper = _ATOM_ALIASES.get(template.name, {}).get(upper, upper)
+    upper = NAMES["atoms"].get(template.name, {}).get(upper, upper)
     if upper in template.heavy:
         return upper
     if template.is_amino_acid:
-        terminal = _TERMINAL_ALIASES.get(upper, upper)
+        terminal = NAMES["terminal_atoms"].get(upper, upper)
         if terminal in ("O", "OXT"):
             return terminal
     return None
@@ -97,12 +83,7 @@ def canonical_heavy_name(template: ResidueTemplate, name: str) -> str | None:
 
 def is_water_name(residue_name: str) -> bool:
     """Whether this is one of the usual names of water; what the residue is, its elements say."""
-    return residue_name.upper() in _WATERS
-
-
-def amino_acid_names() -> list[str]:
-    """Three-letter names of the twenty."""
-    return list(ONE_LETTER.values())
+    return residue_name.upper() in NAMES["waters"]
 
 
 @cache

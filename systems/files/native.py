@@ -34,10 +34,7 @@ def compiled_program(
     source: Path, macros: Mapping[str, float] | None = None, headers: Path | None = None
 ) -> ctypes.CDLL:
     """Compile `source` with these macros and the `headers` of a folder, else of its own, for this processor, once for
-    each version of them, and load it.
-
-    Raises CompilerError, and OSError where nothing can be kept.
-    """
+    each version of them, and load it. Raises CompilerError, and OSError where nothing can be kept."""
     compiler = next((c for c in ("g++", "c++") if shutil.which(c)), None)
     if compiler is None:
         raise CompilerError("no C++ compiler (g++) was found")

@@ -67,11 +67,9 @@ def refuse_existing(path: Path, overwrite: bool) -> None:
 
 
 def create_whole(path: Path, content: bytes | str | Callable[[Path], object]) -> None:
-    """Write a file under a name that nobody can guess and rename it to `path` when it is on the medium.
-
-    `content`: bytes, text, or a function that fills the file whose path it is given. An existing `path` is replaced
-    only at the end. It has the rights of any new file. Raises StorageError when the disk is full or not writable.
-    """
+    """Write a file under a name that nobody can guess and rename it to `path` when it is on the medium. `content`:
+    bytes, text, or a function that fills the file whose path it is given. An existing `path` is replaced only at the
+    end. It has the rights of any new file. Raises StorageError when the disk is full or not writable."""
     temporary = None
     try:
         descriptor, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=".new")
@@ -113,11 +111,9 @@ def replica_paths(out: Path, n_replicas: int) -> list[Path]:
 
 
 class OutputLock:
-    """A lock on `.NAME.lock` beside an output, which the system gives back when this process ends, however it ends.
-
-    It holds against other threads of this process, too. Raises TrajectoryError when another one has the output, and has
-    not let go of it after `patience_s`; KeyboardInterrupt when `stopped()` while waiting; StorageError.
-    """
+    """A lock on `.NAME.lock` beside an output, which the system gives back when this process ends, however it ends. It
+    holds against other threads of this process, too. Raises TrajectoryError when another one has the output, and has
+    not let go of it after `patience_s`; KeyboardInterrupt when `stopped()` while waiting; StorageError."""
 
     def __init__(self, path: Path, *, patience_s: float = 0.0, stopped: Callable[[], bool] = lambda: False) -> None:
         self._path = path.resolve()

@@ -14,6 +14,8 @@ the program's defaults. Model systems, which no force field knows, bring setting
 
 from __future__ import annotations
 
+import tomllib
+from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from functools import cache
 from importlib.resources import files
@@ -38,49 +40,11 @@ class Protocol:
     source: str
 
 
-# The friction is ours, and low, but a window of the forecasting task is not deterministic: two runs from one state that
-# draw other noise are 0.07 Å (aspirin) to 0.12 Å (ethanol) apart after 100 fs, root mean square over atoms, and 0.10 to
-# 0.22 Å after 150 fs; the best forecast of one of them is off by that over √2.
-_MD17: dict[str, Any] = {
-    "force_field": "gaff2",
-    "solvent": "vacuum",
-    "temperature_k": 500.0,
-    "friction_per_ps": 0.1,
-    "timestep_ps": 0.0005,
-    "hydrogen_mass_da": None,
-    "constrain_hydrogens": False,
-    "save_every_ps": 0.005,
-}
-_MDGEN: dict[str, Any] = {
-    "force_field": "ff14SB",
-    "solvent": "gbn2",
-    "temperature_k": 350.0,
-    "friction_per_ps": 0.3,
-    "timestep_ps": 0.002,
-    "hydrogen_mass_da": None,
-    "save_every_ps": 0.1,
-}
+with (files("systems.library") / "data" / "library.toml").open("rb") as _file:
+    _LIBRARY: dict[str, Any] = tomllib.load(_file)
 PROTOCOLS = {
-    "md17": Protocol(
-        "md17",
-        _MD17,
-        "MD17, Chmiela et al., Sci. Adv. 3, e1603015 (2017), every tenth frame as in GeoTDM; GAFF2 for their PBE",
-    ),
-    "md22": Protocol(
-        "md22",
-        _MD17 | {"force_field": "ff14SB", "timestep_ps": 0.001, "save_every_ps": 0.01},
-        "MD22, Chmiela et al., Sci. Adv. 9, eadf0873 (2023): 500 K, 1 fs; ff14SB in vacuum for their PBE+MBD",
-    ),
-    "mdgen": Protocol(
-        "mdgen",
-        _MDGEN,
-        "MDGen's implicit-solvent runs: Jing, Stärk, Jaakkola and Berger, NeurIPS 2024 (100 ns each)",
-    ),
-    "fast-folders": Protocol(
-        "fast-folders",
-        {"force_field": "ff14SB", "solvent": "obc2", "temperature_k": 340.0},
-        "340 K, near chignolin's melting temperature: Lindorff-Larsen et al., Science 334, 517 (2011)",
-    ),
+    name: Protocol(name, {k: None if v == "natural" else v for k, v in said["settings"].items()}, said["source"])
+    for name, said in _LIBRARY["protocols"].items()
 }
 
 
@@ -110,10 +74,8 @@ def double_well() -> Scene:
 
 
 def particles(name: str, law: dict[str, Any], positions_nm: npt.ArrayLike) -> Scene:
-    """Return a scene of particles of 12 Da at `(n, 3)` nm under `law` (see the module).
-
-    Raises InputError when the law is unknown or incomplete.
-    """
+    """Return a scene of particles of 12 Da at `(n, 3)` nm under `law` (see the module). Raises InputError when the law
+    is unknown or incomplete."""
     positions = np.array(positions_nm, dtype=np.float64)
     n = len(positions)
     check_law(law)
@@ -154,12 +116,9 @@ def check_law(law: dict[str, Any]) -> None:
 
 @dataclass(frozen=True)
 class Entry:
-    """One scene of the library.
-
-    `smiles` or `sequence` say what the data file was made from; model systems have neither. `file`: the data file,
-    named after the entry unless it is shared. `own_settings`: of a model system, and `source`, where they come from;
-    `protocols`: names of those that papers simulated this molecule by.
-    """
+    """One scene of the library. `smiles` or `sequence` say what the data file was made from; model systems have
+    neither. `file`: the data file, named after the entry unless it is shared. `own_settings`: of a model system, and
+    `source`, where they come from; `protocols`: names of those that papers simulated this molecule by."""
 
     name: str
     group: str
@@ -177,55 +136,18 @@ AMINO_ACIDS = "capped amino acids"
 MOLECULES = "MD17 molecules"
 ANALYTIC = "analytic systems"
 
-_BATH_SETTINGS: dict[str, Any] = {
-    "temperature_k": 300.0,
-    "friction_per_ps": 1.0,
-    "timestep_ps": 0.01,
-    "save_every_ps": 0.1,
-}
 
-_AMINO_ACIDS = {
-    "ALA": "alanine", "ARG": "arginine, +1", "ASN": "asparagine", "ASP": "aspartate, -1", "CYS": "cysteine",
-    "GLN": "glutamine", "GLU": "glutamate, -1", "GLY": "glycine", "HID": "histidine, hydrogen on N-delta",
-    "HIE": "histidine, hydrogen on N-epsilon", "HIP": "histidine, both hydrogens, +1", "ILE": "isoleucine",
-    "LEU": "leucine", "LYS": "lysine, +1", "MET": "methionine", "PHE": "phenylalanine", "PRO": "proline",
-    "SER": "serine", "THR": "threonine", "TRP": "tryptophan", "TYR": "tyrosine", "VAL": "valine",
-}  # fmt: skip
-
-# Atoms stand in the order of the SMILES, hydrogens after; for ethanol and malonaldehyde that is MD17's own order.
-_SMILES = {
-    "aspirin": ("CC(=O)Oc1ccccc1C(=O)O", "acetylsalicylic acid"),
-    "benzene": ("c1ccccc1", "benzene"),
-    "ethanol": ("C(C)O", "ethanol, atoms in MD17's order"),
-    "malonaldehyde": ("C(CC=O)=O", "malonaldehyde, the dialdehyde as in MD17 (not the enol), in MD17's order"),
-    "naphthalene": ("c1ccc2ccccc2c1", "naphthalene"),
-    "salicylic-acid": ("c1ccc(c(c1)C(=O)O)O", "2-hydroxybenzoic acid"),
-    "toluene": ("Cc1ccccc1", "toluene"),
-    "uracil": ("c1c[nH]c(=O)[nH]c1=O", "uracil, the diketo form"),
-}
-
-
-def _entries() -> list[Entry]:
-    found = [
-        Entry("alanine-dipeptide", PEPTIDES, "ACE-ALA-NME: the usual first peptide, two backbone torsions (phi, psi)",
-              sequence="ACE-ALA-NME"),
-        Entry("ac-ala3-nhme", PEPTIDES, "ACE-ALA-ALA-ALA-NME, the peptide of MD22", protocols=("md22",),
-              sequence="ACE-ALA-ALA-ALA-NME"),
-        Entry("chignolin", PEPTIDES, "GYDPETGTWG (PDB 1UAO), built extended from its sequence, not folded",
-              protocols=("fast-folders",), sequence="GYDPETGTWG"),
-        Entry("cln025", PEPTIDES, "YYDPETGTWY (PDB 5AWL), the stabler chignolin, built extended, not folded",
-              protocols=("fast-folders",), sequence="YYDPETGTWY"),
-    ]  # fmt: skip
-    for code, title in _AMINO_ACIDS.items():
-        name = f"ACE-{code}-NME"
-        file = "alanine-dipeptide" if code == "ALA" else ""
-        found.append(Entry(name, AMINO_ACIDS, title, sequence=name, file=file))
-    for name, (smiles, title) in _SMILES.items():
-        found.append(Entry(name, MOLECULES, title, protocols=("md17",), smiles=smiles))
-    single = (("harmonic-oscillator", "one particle, one force constant an axis: variance kT/k, frequency sqrt(k/m)"),
-              ("double-well", "one particle, two wells of unequal depth: populations by quadrature"))  # fmt: skip
-    found += [Entry(name, ANALYTIC, title, _BATH_SETTINGS, "this program's own") for name, title in single]
-    return found
+def _entries() -> Iterator[Entry]:
+    for name, said in _LIBRARY["peptides"].items():
+        protocols = (said["protocol"],) if "protocol" in said else ()
+        yield Entry(name, PEPTIDES, said["title"], protocols=protocols, sequence=said["sequence"])
+    for code, title in _LIBRARY["amino_acids"].items():
+        name, file = f"ACE-{code}-NME", "alanine-dipeptide" if code == "ALA" else ""
+        yield Entry(name, AMINO_ACIDS, title, sequence=name, file=file)
+    for name, (smiles, title) in _LIBRARY["molecules"].items():
+        yield Entry(name, MOLECULES, title, protocols=("md17",), smiles=smiles)
+    for name, title in _LIBRARY["model_systems"].items():
+        yield Entry(name, ANALYTIC, title, _LIBRARY["model_settings"], "this program's own")
 
 
 ENTRIES: dict[str, Entry] = {each.name: each for each in _entries()}
@@ -265,10 +187,8 @@ def entry(name: str) -> Entry:
 
 
 def load(name: str) -> Scene:
-    """Return a named scene, with bonds, bond orders, masses and residues.
-
-    Raises UnknownNameError, and PreparationError for a peptide that cannot be built.
-    """
+    """Return a named scene, with bonds, bond orders, masses and residues. Raises UnknownNameError, and PreparationError
+    for a peptide that cannot be built."""
     found = entry(name)
     provenance: dict[str, Any] = {"source": "library", "library_name": found.name, "repairs": []}
     if found.group == ANALYTIC:

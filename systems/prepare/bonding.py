@@ -220,15 +220,10 @@ class _Bonds:
 
     def add_hydrogens(self, free: set[int]) -> dict[int, str]:
         """Each hydrogen to the nearest heavy atom of its residue, or of all where the residue's names say nothing.
-
-        Returns how far those are that are far from everything: their heavy atoms may be missing.
-        """
-        from scipy.spatial import cKDTree
-
+        Returns how far those are that are far from everything: their heavy atoms may be missing."""
         atoms, x = self.atoms, self.x
         bonded = {i for pair in self.bonds for i in pair}
         heavy = np.array([i for i, a in enumerate(atoms) if a.element != "H" and i not in self.ions], dtype=np.int64)
-        tree = cKDTree(x[heavy]) if len(heavy) else None
         strays = {}
         for i, atom in enumerate(atoms):
             if atom.element != "H" or i in bonded:
@@ -238,9 +233,9 @@ class _Bonds:
             if i not in free and len(own):
                 gaps = np.linalg.norm(x[own] - x[i], axis=1)
                 parent, distance = int(own[gaps.argmin()]), float(gaps.min())
-            if distance > _HYDROGEN_NM and tree is not None:
-                distance, k = tree.query(x[i])
-                parent = int(heavy[k])
+            if distance > _HYDROGEN_NM and len(heavy):
+                gaps = np.linalg.norm(x[heavy] - x[i], axis=1)
+                parent, distance = int(heavy[gaps.argmin()]), float(gaps.min())
             if distance <= _HYDROGEN_NM:
                 self.bonds.add(_pair(i, parent))
             else:

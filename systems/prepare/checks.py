@@ -130,10 +130,8 @@ Handedness = dict[tuple[str, str], int]
 
 
 def handedness(residues: Iterable[tuple[str, str, Mapping[str, AtomRecord]]]) -> Handedness:
-    """Return +1 (natural), -1 (inverted) or 0 (flat) of each stereocentre whose atoms are all there.
-
-    `residues`: (label, standard name, heavy atoms under their standard names). Centres are CA, and CB of THR and ILE.
-    """
+    """Return +1 (natural), -1 (inverted) or 0 (flat) of each stereocentre whose atoms are all there. `residues`:
+    (label, standard name, heavy atoms under their standard names). Centres are CA, and CB of THR and ILE."""
     found: Handedness = {}
     for label, name, heavy in residues:
         for row in (_ALPHA, _BETA[name]) if name in _BETA else (_ALPHA,):
@@ -156,11 +154,12 @@ def refuse_changed(before: Handedness, after: Handedness) -> None:
 
 
 def say_inverted(found: Handedness, notes: list[str]) -> None:
-    """Note the residues that are not L, or whose side chain is the other diastereomer, as the file has them."""
+    """Note the residues that are not L, flat, or the other diastereomer at CB, as the file has them."""
+    flat = "flat stereocentres, as the file has them"
     for centre, words in (("CA", "D-residues, as the file has them"), ("CB", "the other diastereomer at CB")):
-        names = [label for (label, atom), sign in found.items() if atom == centre and sign < 0]
-        if names:
-            notes.append(f"{words}: {listed(names)}")
+        for sign, said in ((-1, words), (0, flat)):
+            if names := [label for (label, atom), of in found.items() if atom == centre and of == sign]:
+                notes.append(f"{said}: {listed(names)}")
 
 
 # ---- molecules made whole by cell vectors ---------------------------------------------------------------------------
@@ -229,10 +228,8 @@ _CLOSE_ANGSTROM = (1.5, 1.1, 0.9)
 
 
 def check_contacts(atoms: Sequence[AtomRecord], bonds: IntArray) -> list[str]:
-    """Return a note of atoms that are close, with more than three bonds between them; none where all keep apart.
-
-    Raises PreparationError for atoms that have the same place.
-    """
+    """Return a note of atoms that are close, with more than three bonds between them; none where all keep apart. Raises
+    PreparationError for atoms that have the same place."""
     neighbours = neighbours_of(bonds, len(atoms))
     x = np.array([a.position_angstrom for a in atoms])
     found = []

@@ -9,7 +9,7 @@ from dataclasses import replace
 import networkx as nx
 import numpy as np
 
-from systems.chemistry.residues import is_water_name, template_for
+from systems.chemistry.residues import NAMES, is_water_name, template_for
 from systems.errors import PreparationError, listed
 from systems.prepare.bonding import are_ions
 from systems.prepare.records import AtomRecord, Bonding, by_residue
@@ -25,11 +25,9 @@ _DIRECTIONS = 64
 def complete_waters(
     waters: Sequence[AtomRecord], others: Sequence[AtomRecord], notes: list[str]
 ) -> tuple[list[AtomRecord], IntArray]:
-    """Return the waters as oxygen and two hydrogens each, in the file's order, and their bonds `(n_bonds, 2)`.
-
-    A hydrogen belongs to the nearest oxygen, within 1.3 Å. Oxygens without their two are given new ones, turned away
-    from what stands near (of `others` and the waters); `notes` says to how many.
-    """
+    """Return the waters as oxygen and two hydrogens each, in the file's order, and their bonds `(n_bonds, 2)`. A
+    hydrogen belongs to the nearest oxygen, within 1.3 Å. Oxygens without their two are given new ones, turned away from
+    what stands near (of `others` and the waters); `notes` says to how many."""
     from scipy.spatial import cKDTree
 
     oxygens = [a for a in waters if a.element == "O"]
@@ -78,15 +76,6 @@ def _freest(oxygen: FloatArray, near: FloatArray, rng: np.random.Generator) -> F
 
 
 _BOUND_ANGSTROM = 3.0
-# What crystals are grown from and frozen in, and what peptides are delivered as salts of: component and heavy atoms.
-_AGENTS = {
-    "1PE": "C10O6", "ACN": "C3O", "ACT": "C2O2", "ACY": "C2O2", "AZI": "N3", "BCT": "CO3", "BME": "C2OS",
-    "BTB": "C8NO5", "CAC": "AsC2O2", "CCN": "C2N", "CIT": "C6O7", "CO3": "CO3", "DIO": "C4O2", "DMF": "C3NO",
-    "DMS": "C2OS", "DTT": "C4O2S2", "EDO": "C2O2", "EOH": "C2O", "EPE": "C8N2O4S", "FLC": "C6O7", "FMT": "CO2",
-    "GOL": "C3O3", "IMD": "C3N2", "IPA": "C3O", "MES": "C6NO4S", "MLI": "C3O4", "MOH": "CO", "MPD": "C6O2",
-    "MRD": "C6O2", "NH4": "N", "NO3": "NO3", "P6G": "C12O7", "PEG": "C4O3", "PG4": "C8O5", "PGE": "C6O4",
-    "PGO": "C3O2", "PO4": "O4P", "SCN": "CNS", "SO4": "O4S", "TFA": "C2F3O2", "TLA": "C4O6", "TRS": "C4NO3",
-}  # fmt: skip
 
 
 def is_water(atoms: Sequence[AtomRecord]) -> bool:
@@ -100,11 +89,9 @@ def is_water(atoms: Sequence[AtomRecord]) -> bool:
 def resolve_solvent(
     atoms: Sequence[AtomRecord], kept: Sequence[int], *, keep_water: bool, keep_ions: bool, notes: list[str]
 ) -> tuple[list[int], list[int]]:
-    """Return the indices that stay, and those of waters to be kept beside them; `notes` says what is left out.
-
-    Left out are waters unless `keep_water`, and free ions unless `keep_ions`: monatomic, no N, O or S of anything else
-    within 3 Å. Of a file that holds nothing else, all stays.
-    """
+    """Return the indices that stay, and those of waters to be kept beside them; `notes` says what is left out. Left out
+    are waters unless `keep_water`, and free ions unless `keep_ions`: monatomic, no N, O or S of anything else within 3
+    Å. Of a file that holds nothing else, all stays."""
     # All oxygens of waters may stand before all hydrogens.
     runs = [[kept[k] for k in members] for members in by_residue([atoms[i] for i in kept]).values()]
     water = [run for run in runs if is_water([atoms[i] for i in run])]
@@ -165,12 +152,9 @@ def ligand_atoms(atoms: Sequence[AtomRecord], bonding: Bonding) -> list[int]:
 def resolve_ligands(
     atoms: Sequence[AtomRecord], ligands: Sequence[int], *, keep: bool, drop: bool, notes: list[str]
 ) -> list[int]:
-    """Return which of the ligands stay; `notes` says which do, and which are left out.
-
-    Agents of crystallisation, buffers and counter-ions, known by name and elements, are left out unless `keep`. Raises
-    PreparationError for other ligands where neither keeping nor dropping was asked for, and for kept ones without
-    hydrogens.
-    """
+    """Return which of the ligands stay; `notes` says which do, and which are left out. Agents of crystallisation,
+    buffers and counter-ions, known by name and elements, are left out unless `keep`. Raises PreparationError for other
+    ligands where neither keeping nor dropping was asked for, and for kept ones without hydrogens."""
     residues = {key: [ligands[k] for k in run] for key, run in by_residue([atoms[i] for i in ligands]).items()}
     if not (keep or drop):
         agents = {key for key, members in residues.items() if _is_agent(key[2], [atoms[i].element for i in members])}
@@ -203,4 +187,4 @@ def resolve_ligands(
 
 def _is_agent(name: str, elements: Sequence[str]) -> bool:
     count = Counter(e for e in elements if e != "H")
-    return _AGENTS.get(name.upper()) == "".join(f"{e}{n if n > 1 else ''}" for e, n in sorted(count.items()))
+    return NAMES["agents"].get(name.upper()) == "".join(f"{e}{n if n > 1 else ''}" for e, n in sorted(count.items()))

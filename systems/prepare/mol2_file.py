@@ -15,11 +15,11 @@ import networkx as nx
 import numpy as np
 
 from systems.chemistry.bond_orders import bent_carbons, lewis_structure
-from systems.chemistry.element_data import element_symbol, ion_symbol, is_element, is_lone_ion
+from systems.chemistry.element_data import element_symbol, ion_symbol, is_lone_ion
 from systems.chemistry.residues import canonical_heavy_name, template_for
 from systems.errors import InputError, PreparationError, listed
 from systems.prepare.records import AtomRecord, StructureFile, read_text
-from systems.scene import neighbours_of
+from systems.scene import ATOMIC_NUMBERS, neighbours_of
 
 _TWO_LETTERS = re.compile(r"cl|br|si|se", re.IGNORECASE)
 _FIRST_LETTERS = ("H", "B", "C", "N", "O", "F", "P", "S", "I")
@@ -107,7 +107,7 @@ def element_of(atom_type: str, name: str, *, alone: bool = False) -> str | None:
     ion = next((e for e in map(ion_symbol, (name, head)) if e is not None), None) if alone else None
     if ion is not None:
         return ion
-    if dot and is_element(head.capitalize()):
+    if dot and head.capitalize() in ATOMIC_NUMBERS:
         return head.capitalize()
     letters = head.lstrip("0123456789")
     if letters.isalpha() and letters.capitalize() in _METALS:
@@ -121,12 +121,9 @@ def element_of(atom_type: str, name: str, *, alone: bool = False) -> str | None:
 
 
 def molecule_of(found: Mol2) -> Any:
-    """Return the RDKit molecule (unsanitised, hydrogens explicit) with perceived orders and charges.
-
-    Each molecule of a file is perceived by itself. Of structures that differ in their charge, that of the partial
-    charges is chosen. Raises PreparationError where no Lewis structure fits, or the geometry says that hydrogens are
-    missing.
-    """
+    """Return the RDKit molecule (unsanitised, hydrogens explicit) with perceived orders and charges. Each molecule of a
+    file is perceived by itself. Of structures that differ in their charge, that of the partial charges is chosen.
+    Raises PreparationError where no Lewis structure fits, or the geometry says that hydrogens are missing."""
     from rdkit import Chem
 
     molecule = Chem.RWMol()

@@ -15,6 +15,7 @@ import numpy as np
 from systems.chemistry.distance_bonds import refuse_long_bonds
 from systems.chemistry.element_data import atomic_weight_da
 from systems.chemistry.geometry import near_pairs
+from systems.chemistry.residues import NAMES
 from systems.errors import InputError, PreparationError, first_line, listed
 from systems.prepare.mol2_file import molecule_of, read_mol2
 from systems.prepare.records import file_name_and_provenance, read_text, suffix_of
@@ -131,10 +132,8 @@ def scene_from_component(text: str, path: Path) -> Scene:
 
 
 def scene_from_rdkit(molecule: Any, *, name: str, provenance: dict[str, Any]) -> Scene:
-    """Return the scene of an RDKit molecule with all hydrogens and one conformer, in its atom order.
-
-    One residue; atoms are called after their element and a number, C1, C2, ... Adds `multiplicity` to the provenance.
-    """
+    """Return the scene of an RDKit molecule with all hydrogens and one conformer, in its atom order. One residue; atoms
+    are called after their element and a number, C1, C2, ... Adds `multiplicity` to the provenance."""
     from rdkit import Chem
 
     drawn = Chem.Mol(molecule)
@@ -165,10 +164,8 @@ def scene_from_rdkit(molecule: Any, *, name: str, provenance: dict[str, Any]) ->
 
 
 def _resolved(molecule: Any, notes: list[str]) -> Any:
-    """Return an unsanitised molecule with all hydrogens, at its own positions if it has three-dimensional ones.
-
-    Raises PreparationError for what is no molecule, or has atoms on one point.
-    """
+    """Return an unsanitised molecule with all hydrogens, at its own positions if it has three-dimensional ones. Raises
+    PreparationError for what is no molecule, or has atoms on one point."""
     require(molecule)
     sanitise(molecule)
     drop_isotopes(molecule, notes)
@@ -215,26 +212,14 @@ def _is_drawing(molecule: Any, conformer: Any) -> bool:
 # ---- salts ----------------------------------------------------------------------------------------------------------
 
 
-# What drugs are sold with (the salts of the pharmacopoeias), uncharged; and water, ammonia and what has no such form.
-_COUNTERIONS = (
-    "Cl", "Br", "I", "F", "O", "N", "OS(O)(=O)=O", "OP(O)(O)=O", "O[N+]([O-])=O", "OC(O)=O", "OCl(=O)(=O)=O",
-    "F[B-](F)(F)F", "F[P-](F)(F)(F)(F)F", "OC=O", "CC(O)=O", "OC(=O)C(F)(F)F", "CCC(O)=O", "OCC(O)=O", "CC(O)C(O)=O",
-    "OC(=O)C(O)=O", "OC(=O)CC(O)=O", "OC(=O)CCC(O)=O", "OC(=O)C=CC(O)=O", "OC(=O)CC(O)C(O)=O", "OC(=O)C(O)C(O)C(O)=O",
-    "OC(=O)CC(O)(CC(O)=O)C(O)=O", "OCC(O)C(O)C(O)C(O)C(O)=O", "CS(O)(=O)=O", "CCS(O)(=O)=O", "OCCS(O)(=O)=O",
-    "OS(=O)(=O)CCS(O)(=O)=O", "OS(=O)(=O)c1ccccc1", "Cc1ccc(cc1)S(O)(=O)=O", "OS(=O)(=O)C(F)(F)F", "COS(O)(=O)=O",
-    "OC(=O)c1cc2ccccc2c(c1O)Cc1c(O)c(cc2ccccc12)C(O)=O", "NC(CO)(CO)CO", "CNCC(O)C(O)C(O)C(O)CO",
-)  # fmt: skip
 # Other metals hold what stands beside them: ferrocene is no salt.
 _MONATOMIC = ("Li", "Na", "K", "Rb", "Cs", "Mg", "Ca", "Sr", "Ba", "Al", "Zn", "F", "Cl", "Br", "I")
 
 
 def main_molecule(molecule: Any, notes: list[str]) -> Any:
-    """Return the one molecule that an unsanitised RDKit molecule means, its atoms in their order.
-
-    Counterions, water and further copies beside it are left out and said; of counterions alone the organic one.
-    Its charge stays as written. Raises PreparationError for a mixture: several molecules of which none is known to be a
-    counterion.
-    """
+    """Return the one molecule that an unsanitised RDKit molecule means, its atoms in their order. Counterions, water
+    and further copies beside it are left out and said; of counterions alone the organic one. Its charge stays as
+    written. Raises PreparationError for a mixture: several molecules of which none is known to be a counterion."""
     from rdkit import Chem
 
     parts = list(Chem.GetMolFrags(molecule, asMols=True, sanitizeFrags=False))
@@ -261,7 +246,7 @@ def main_molecule(molecule: Any, notes: list[str]) -> Any:
 def _known() -> frozenset[str]:
     from rdkit import Chem
 
-    return frozenset(_key(Chem.MolFromSmiles(smiles)) for smiles in _COUNTERIONS)
+    return frozenset(_key(Chem.MolFromSmiles(smiles)) for smiles in NAMES["counterions"])
 
 
 def _key(part: Any) -> str:
@@ -333,10 +318,8 @@ def require(molecule: Any) -> None:
 
 def embed(molecule: Any, *, seed: int, notes: list[str]) -> Any:
     """Return the molecule (all hydrogens in it) with one conformer: ETKDG (Riniker and Landrum, 2015), then MMFF94 or
-    UFF. Stereo that it leaves open is drawn, and said in `notes`.
-
-    Raises PreparationError when RDKit finds no geometry or the geometry has other stereo than the molecule.
-    """
+    UFF. Stereo that it leaves open is drawn, and said in `notes`. Raises PreparationError when RDKit finds no geometry
+    or the geometry has other stereo than the molecule."""
     from rdkit import Chem, rdBase
     from rdkit.Chem import rdDistGeom
     from rdkit.Chem import rdForceFieldHelpers as force_fields

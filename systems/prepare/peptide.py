@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from systems.chemistry.geometry import extend, superposition
-from systems.chemistry.residues import ONE_LETTER, amino_acid_names, template_for
+from systems.chemistry.residues import ONE_LETTER, template_for
 from systems.errors import PreparationError, nearest
 from systems.prepare.records import scene_from_records
 from systems.prepare.repair import fixed_random_numbers, protonation_summary, records_from_openmm, residue_shape
@@ -22,11 +22,9 @@ _N_CA_C, _CA_C_N, _C_N_CA, _CA_C_O = 111.2, 116.2, 121.7, 120.8
 
 
 def parse_sequence(text: str) -> list[str]:
-    """Return three-letter residue names of `ACE-ALA-NME`, or of one-letter code (`SDFS`).
-
-    A single known three-letter name is one residue. Raises PreparationError for unknown residues and misplaced caps.
-    """
-    allowed = [*amino_acid_names(), *_PROTONATED, "ACE", "NME"]
+    """Return three-letter residue names of `ACE-ALA-NME`, or of one-letter code (`SDFS`). A single known three-letter
+    name is one residue. Raises PreparationError for unknown residues and misplaced caps."""
+    allowed = [*ONE_LETTER.values(), *_PROTONATED, "ACE", "NME"]
     written = text.strip()
     word = written.upper()
     is_named = "-" in word or word in allowed
@@ -55,10 +53,8 @@ def parse_sequence(text: str) -> list[str]:
 
 
 def build_peptide(text: str, *, ph: float = 7.0) -> Scene:
-    """Return an extended peptide, relaxed in ff14SB without charges; uncapped ends are charged.
-
-    Raises PreparationError for an unknown residue, or one that ff14SB lacks.
-    """
+    """Return an extended peptide, relaxed in ff14SB without charges; uncapped ends are charged. Raises PreparationError
+    for an unknown residue, or one that ff14SB lacks."""
     from openmm import Platform, app, unit
 
     names = parse_sequence(text)

@@ -143,10 +143,8 @@ class Residue:
 @dataclass
 class Bonding:
     """Bonds `(n_bonds, 2)`, the residues in the order of the file, and a summary of where bonds came from.
-
     `peptide_bonds` are the pairs (C, N) that join standard residues, `unmade` the bonds that the file states and that
-    are none.
-    """
+    are none."""
 
     bonds: IntArray
     residues: list[Residue]
@@ -174,10 +172,8 @@ _PATCHES = {"ACE": ("CAY", "CY", "OY"), "NME": ("NT", "CAT")}
 
 
 def standardise(atoms: Sequence[AtomRecord], notes: list[str]) -> list[AtomRecord]:
-    """Return the atoms with selenomethionine as methionine and CHARMM's patched caps as residues ACE and NME.
-
-    Order and positions stay; `notes` names each residue that changed.
-    """
+    """Return the atoms with selenomethionine as methionine and CHARMM's patched caps as residues ACE and NME. Order and
+    positions stay; `notes` names each residue that changed."""
     out = list(atoms)
     changed = []
     for i, atom in enumerate(atoms):
@@ -208,11 +204,9 @@ def standardise(atoms: Sequence[AtomRecord], notes: list[str]) -> list[AtomRecor
 
 
 def scene_from_records(atoms: Sequence[AtomRecord], bonds: IntArray, *, name: str, provenance: dict[str, Any]) -> Scene:
-    """Return the scene of these atoms in their order, bonds `(n_bonds, 2)`; orders and charges are perceived.
-
-    A residue is a run of atoms with one chain, number and name: a file that mixes residues has some of them repeat.
-    Raises PreparationError when the connectivity fits no Lewis structure.
-    """
+    """Return the scene of these atoms in their order, bonds `(n_bonds, 2)`; orders and charges are perceived. A residue
+    is a run of atoms with one chain, number and name: a file that mixes residues has some of them repeat. Raises
+    PreparationError when the connectivity fits no Lewis structure."""
     elements = [a.element for a in atoms]
     bonds = np.sort(bonds.reshape(-1, 2), axis=1)
     bonds = bonds[np.lexsort((bonds[:, 1], bonds[:, 0]))]

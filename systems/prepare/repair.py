@@ -11,7 +11,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import lru_cache
 from importlib.resources import files
-from itertools import product
+from itertools import permutations, product
 from pathlib import Path
 from typing import Any
 
@@ -158,10 +158,8 @@ def fixed_random_numbers() -> Iterator[None]:
 
 
 def _chains(bonding: Bonding) -> list[list[Residue]]:
-    """Residues as peptide bonds join them, from first to last, whatever their order in the file.
-
-    A cycle is opened between residues that have no protonation to be settled, where it can be.
-    """
+    """Residues as peptide bonds join them, from first to last, whatever their order in the file. A cycle is opened
+    between residues that have no protonation to be settled, where it can be."""
     of_atom = {i: k for k, r in enumerate(bonding.residues) for i in r.atoms}
     following = {of_atom[c]: of_atom[n] for c, n in bonding.peptide_bonds}
     before = {n: c for c, n in following.items()}
@@ -206,11 +204,9 @@ def _heavy_atom_text(atoms: Sequence[AtomRecord], chains: Sequence[Sequence[Resi
 
 
 def _built(residue: Residue, atoms: Sequence[AtomRecord]) -> dict[str, list[float]]:
-    """Positions in Å of a missing CB (of an L residue) and OXT, from the backbone.
-
-    PDBFixer superposes its template on N, CA, C and O, which are nearly in one plane, and then and now comes out with a
-    D residue; an OXT it adds may stand 3 Å from its carbon.
-    """
+    """Positions in Å of a missing CB (of an L residue) and OXT, from the backbone. PDBFixer superposes its template on
+    N, CA, C and O, which are nearly in one plane, and then and now comes out with a D residue; an OXT it adds may stand
+    3 Å from its carbon."""
     heavy = {a: np.array(atoms[i].position_angstrom) for a, i in residue.heavy.items()}
     out: dict[str, list[float]] = {}
     if "CB" in residue.missing and {"N", "CA", "C"} <= set(heavy):
@@ -262,8 +258,6 @@ def _keep_hydrogens(
     records: list[AtomRecord], bonds: IntArray, atoms: Sequence[AtomRecord], bonding: Bonding
 ) -> list[AtomRecord]:
     """Put the file's hydrogens back where a heavy atom has as many as before."""
-    from scipy.optimize import linear_sum_assignment
-
     whole = {r.key: r for r in bonding.residues if r.heavy and not r.lacks_hydrogens}
     before, after = bonding.neighbours, neighbours_of(bonds, len(records))
     out = list(records)
@@ -274,10 +268,10 @@ def _keep_hydrogens(
         old = [] if kept is None else [j for j in before[kept] if atoms[j].element == "H"]
         if not new or len(old) != len(new):
             continue
-
-        cost = [[distance_angstrom(records[j], atoms[i]) ** 2 for i in old] for j in new]
-        for a, b in zip(*linear_sum_assignment(cost), strict=True):
-            out[new[a]] = replace(records[new[a]], position_angstrom=atoms[old[b]].position_angstrom)
+        best = min(permutations(old), key=lambda order: sum(
+            distance_angstrom(records[j], atoms[i]) ** 2 for j, i in zip(new, order, strict=True)))  # fmt: skip
+        for j, i in zip(new, best, strict=True):
+            out[j] = replace(records[j], position_angstrom=atoms[i].position_angstrom)
     return out
 
 
@@ -421,11 +415,9 @@ def resolve_side_chains(
     bonds: Sequence[tuple[int, int]],
     residues: Sequence[tuple[str, str, dict[str, int], Sequence[str]]],
 ) -> list[str]:
-    """Build added side chains that overlap again, in place; return a line for each.
-
-    `positions_nm` `(n_atoms, 3)`, heavy atoms alone; `bonds` pairs of them; `residues`: label, standard name, atoms by
-    name, and the names that were added. Raises PreparationError where an added atom stands in another in every rotamer.
-    """
+    """Build added side chains that overlap again, in place; return a line for each. `positions_nm` `(n_atoms, 3)`,
+    heavy atoms alone; `bonds` pairs of them; `residues`: label, standard name, atoms by name, and the names that were
+    added. Raises PreparationError where an added atom stands in another in every rotamer."""
     graph = nx.Graph(bonds)
     graph.add_nodes_from(range(len(elements)))
     radii = np.array([covalent_radius_nm(e) for e in elements])

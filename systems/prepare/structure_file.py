@@ -112,10 +112,8 @@ def _prepared(found: StructureFile, options: Preparation, repairs: list[str]) ->
 
 def _choose_alternates(found: StructureFile, repairs: list[str]) -> list[int]:
     """Indices of the atoms that stay: of alternate locations the most occupied, one label for all that is bonded.
-
     Labels that most of the bonded residues have go first. A stated bond holds for the alternate that stays: `conect` of
-    `found` is changed to that.
-    """
+    `found` is changed to that."""
     atoms = found.atoms
     labelled = [i for i, a in enumerate(atoms) if a.altloc]
     if not labelled:

@@ -37,11 +37,9 @@ _FARTHEST_ANGSTROM = 9_999.0
 
 
 def read_structure(path: Path) -> StructureFile:
-    """Read a PDB or mmCIF file, gzipped or not.
-
-    Raises InputError (one line: the file, what is wrong, what to do) for a missing file, a directory, a suffix that is
-    neither, bytes that are no text, a record that cannot be read, no atoms, or positions that are not finite.
-    """
+    """Read a PDB or mmCIF file, gzipped or not. Raises InputError (one line: the file, what is wrong, what to do) for a
+    missing file, a directory, a suffix that is neither, bytes that are no text, a record that cannot be read, no atoms,
+    or positions that are not finite."""
     text = structure_text(path)
     found = _read_mmcif(text, path) if is_mmcif(path) else _read_pdb(text, path)
     if not found.atoms:
@@ -75,10 +73,8 @@ def structure_text(path: Path) -> str:
 
 
 def _add_header(structure: Any, found: StructureFile) -> None:
-    """Add the cell and the covalent bonds of a `gemmi.Structure`; of alternates, those that go together are bonded.
-
-    A note says which of the bonds lead to a symmetry copy, or to atoms that the file does not have.
-    """
+    """Add the cell and the covalent bonds of a `gemmi.Structure`; of alternates, those that go together are bonded. A
+    note says which of the bonds lead to a symmetry copy, or to atoms that the file does not have."""
     import gemmi
 
     found.cell_nm = cell_of(structure.cell.parameters)
@@ -200,10 +196,8 @@ def _pdb_atom(line: str, number: int, path: Path) -> AtomRecord:
 
 
 def decode(field: str, width: int) -> int | None:
-    """Return the number in a field of `width` columns, or None where it is neither decimal nor hybrid-36.
-
-    Source: Grosse-Kunstleve et al., cci.lbl.gov/hybrid_36.
-    """
+    """Return the number in a field of `width` columns, or None where it is neither decimal nor hybrid-36. Source:
+    Grosse-Kunstleve et al., cci.lbl.gov/hybrid_36."""
     text = field.strip()
     if text.lstrip("-").isdigit():
         return int(text)
@@ -259,11 +253,9 @@ def _conect(lines: list[str], index_of: dict[str, int], repeated: set[str]) -> t
 
 
 def read_blocks(text: str, path: Path, category: str) -> list[Any]:
-    """Return the `gemmi.cif.Block`s of a file that have a category. Raises InputError where the syntax is broken.
-
-    What other programs get wrong beside the atoms (a tag twice, one without a value, letters beyond ASCII in a title)
-    does no harm.
-    """
+    """Return the `gemmi.cif.Block`s of a file that have a category. Raises InputError where the syntax is broken. What
+    other programs get wrong beside the atoms (a tag twice, one without a value, letters beyond ASCII in a title) does
+    no harm."""
     from gemmi import cif
 
     try:
@@ -323,10 +315,7 @@ _TELLING_NAMES = {"CA", "CH3", "CAY"}
 
 def _cleaned(found: StructureFile, path: Path) -> StructureFile:
     """Return the file without atoms written twice, Drude particles and virtual sites, each said; residues that repeat
-    under one number are told apart by their chains.
-
-    Raises InputError for an atom whose element is not known.
-    """
+    under one number are told apart by their chains. Raises InputError for an atom whose element is not known."""
     gone = _repeated(found.atoms)
     if gone:
         found.notes.append(
@@ -380,9 +369,7 @@ def _sites(atoms: Sequence[AtomRecord], gone: set[int]) -> set[int]:
 
 def _told_apart(atoms: Sequence[AtomRecord], chain_ends: set[int], notes: list[str]) -> list[AtomRecord]:
     """Give a molecule that has the chain letter and the numbers of one before a chain of its own (A, then A:2).
-
-    Programs without chain letters number each molecule from 1, and all start again after 9,999.
-    """
+    Programs without chain letters number each molecule from 1, and all start again after 9,999."""
     copies: dict[str, int] = {}
     seen: dict[ResidueKey, set[str]] = {}
     names_at: dict[tuple[str, str], str] = {}

@@ -287,10 +287,8 @@ class TrajectoryReader(ABC):
         return scene.with_positions(self._read(0, 1, 1)[0]) if self.n_frames else scene
 
     def _check_read(self, name: str, stored: npt.NDArray[Any], frames: slice) -> None:
-        """Raise TrajectoryError unless what was read of `frames`, as it is on disk, is what was written.
-
-        With positions (FRAMES) go what the reader holds of the same frames: times, chunks, flags, scalars.
-        """
+        """Raise TrajectoryError unless what was read of `frames`, as it is on disk, is what was written. With positions
+        (FRAMES) go what the reader holds of the same frames: times, chunks, flags, scalars."""
         if name not in self.checksums or not len(stored):
             return
         columns = {name: stored}
@@ -308,9 +306,7 @@ class TrajectoryReader(ABC):
 
     def read(self, start: int = 0, stop: int | None = None, stride: int = 1) -> Float32Array:
         """Return positions `(n, n_atoms, 3)` float32 nm of frames `start:stop:stride` (negative counts from the end).
-
-        Raises InputError for a stride below 1, TrajectoryError when the frames cannot be read.
-        """
+        Raises InputError for a stride below 1, TrajectoryError when the frames cannot be read."""
         first, last, step = self._span(start, stop, stride)
         if first >= last:
             return np.empty((0, self.n_atoms, 3), dtype=np.float32)
@@ -359,8 +355,6 @@ class TrajectoryReader(ABC):
 
     def iter_blocks(self, n_frames_per_block: int = 4096) -> Iterator[Float32Array]:
         """Yield positions in consecutive blocks of at most `n_frames_per_block` frames."""
-        if n_frames_per_block < 1:
-            raise InputError(f"{self.path}: a block must hold at least one frame, not {n_frames_per_block}.")
         for start in range(0, self.n_frames, n_frames_per_block):
             yield self.read(start, start + n_frames_per_block)
 

@@ -28,10 +28,8 @@ def checkpoint_path(out: Path) -> Path:
 
 def new_header(n_files: int, *, overwrite: bool) -> dict[str, Any]:
     """Return what a checkpoint says of a run of `n_files` trajectories that has not begun: `run_id`, `files`, ...
-
     `overwrite`: whether other files may lie where those of the run are to be. `files`: of each trajectory how many
-    frames it has, and their digest.
-    """
+    frames it has, and their digest."""
     return {"run_id": uuid.uuid4().hex, "overwrite": overwrite, "files": [{"n_frames": 0, "digest": ""}] * n_files}
 
 
@@ -51,21 +49,8 @@ class _Header(TypedDict):
 
 def write_checkpoint(path: Path, header: dict[str, Any], blob: bytes) -> None:
     """Replace the checkpoint as a whole; it is on the medium when this returns, as are the frames that it has seen.
-
-    `header`: a `new_header` kept up to date, and more that is JSON. Raises StorageError: the old one stays.
-    """
+    `header`: a `new_header` kept up to date, and more that is JSON. Raises StorageError: the old one stays."""
     create_whole(path, _MAGIC + packed(header, blob))
-
-
-def refuse_foreign(path: Path) -> None:
-    """Raise InputError where a file lies in the place of a checkpoint that is none (of this version)."""
-    if path.is_file():
-        with path.open("rb") as file:
-            if file.read(len(_MAGIC)) != _MAGIC:
-                raise InputError(
-                    f"{path} lies where the checkpoint goes and is none of this version's; move it away, or choose "
-                    "another name."
-                )
 
 
 def read_checkpoint(path: Path) -> Checkpoint:
@@ -82,10 +67,8 @@ def read_checkpoint(path: Path) -> Checkpoint:
 
 
 def supported_checkpoint(path: Path, outs: Sequence[Path]) -> Checkpoint:
-    """Return the state in a checkpoint, if the frames in the run's trajectories support it, all of them read.
-
-    Raises InputError when the checkpoint is damaged, or a trajectory is gone, damaged, or not the one this run wrote.
-    """
+    """Return the state in a checkpoint, if the frames in the run's trajectories support it, all of them read. Raises
+    InputError when the checkpoint is damaged, or a trajectory is gone, damaged, or not the one this run wrote."""
     header, blob = read_checkpoint(path)
     if len(header["files"]) != len(outs):
         raise InputError(f"checkpoint {path} is not of {len(outs)} trajectories; take as many as it was begun with.")
@@ -99,9 +82,7 @@ def supported_checkpoint(path: Path, outs: Sequence[Path]) -> Checkpoint:
 def writer_at(out: Path, scene: Scene, record: dict[str, Any], header: dict[str, Any], k: int = 0, *, resumed: bool,
               columns: Sequence[str] = ()) -> TrajectoryWriter:  # fmt: skip
     """Return the writer of a run's k-th trajectory, holding the frames that the run's checkpoint has seen, no more.
-
-    Without frames it begins anew: when `resumed`, what lies there is the run's own, or may be replaced.
-    """
+    Without frames it begins anew: when `resumed`, what lies there is the run's own, or may be replaced."""
     n_frames = header["files"][k]["n_frames"]
     how: dict[str, Any] = {"append": True} if n_frames else {"overwrite": resumed or header["overwrite"]}
     writer = open_writer(out, scene, record, columns=columns, run_id=header["run_id"], locked=True, **how)
@@ -147,14 +128,16 @@ def locked_outputs(outs: Sequence[Path], *, may_exist: bool) -> Iterator[None]:
     with ExitStack() as stack:
         for out in outs:
             stack.enter_context(OutputLock(out))
-        refuse_foreign(checkpoint_path(outs[0]))
+        path = checkpoint_path(outs[0])
+        if path.is_file() and not path.read_bytes().startswith(_MAGIC):
+            raise InputError(f"{path} lies where the checkpoint goes and is none of this version's; move it away.")
         for out in outs:
             refuse_existing(out, may_exist)
         before = {member for out in outs for member in family(out) if member.exists()}
         try:
             yield
         except BaseException as error:
-            resumable = isinstance(error, KeyboardInterrupt | StorageError) and checkpoint_path(outs[0]).exists()
+            resumable = isinstance(error, KeyboardInterrupt | StorageError) and path.exists()
             for out in outs if not resumable else ():
                 with suppress(SurromdError, OSError):  # what cannot be read may hold frames
                     if not frames_in(out):

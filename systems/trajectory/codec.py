@@ -110,7 +110,7 @@ def open_trajectory(path: str | Path, *, top: str | Path | None = None) -> Traje
     when a topology is needed, or does not fit.
     """
     from systems.trajectory import dcd_file, foreign_readers, hdf5_file, xtc_file
-    from systems.trajectory.foreign_scenes import XYZ_SUFFIXES, format_of
+    from systems.trajectory.foreign_scenes import XYZ_SUFFIXES, is_mdtraj_format
 
     path, top = Path(path), None if top is None else Path(top)
     suffix = path.suffix.lower()
@@ -129,7 +129,7 @@ def open_trajectory(path: str | Path, *, top: str | Path | None = None) -> Traje
         return foreign_readers.StreamReader(path, top)
     if path.name.lower().endswith((*XYZ_SUFFIXES, ".traj")):
         return foreign_readers.AtomsReader(path, top)
-    if format_of(path).reader == "MDTraj":
+    if is_mdtraj_format(path):
         return foreign_readers.MdtrajReader(path, top)
     return foreign_readers.MdanalysisReader(path, top)
 
@@ -141,10 +141,8 @@ def to_mdtraj(
     source: str | Path | TrajectoryReader, *, start: int = 0, stop: int | None = None, stride: int = 1
 ) -> Any:
     """Return frames `start:stop:stride` of a trajectory, a path or one that is open, as an `mdtraj.Trajectory`.
-
-    Positions, times, bonds and the cell are taken over. Raises InputError for a file without topology,
-    TrajectoryError for a damaged one.
-    """
+    Positions, times, bonds and the cell are taken over. Raises InputError for a file without topology, TrajectoryError
+    for a damaged one."""
     import mdtraj
 
     from systems.chemistry.distance_bonds import lengths_and_angles
@@ -160,10 +158,8 @@ def to_mdanalysis(
     source: str | Path | TrajectoryReader, *, start: int = 0, stop: int | None = None, stride: int = 1
 ) -> Any:
     """Return frames `start:stop:stride` of a trajectory as an `MDAnalysis.Universe` in memory, in its units (Å, ps).
-
     Names, elements, masses, charges, residues, chains (segments) and bonds are taken over. Its reader knows one time
-    step: frames that are unevenly spaced are refused. Raises InputError, TrajectoryError.
-    """
+    step: frames that are unevenly spaced are refused. Raises InputError, TrajectoryError."""
     import MDAnalysis
     from MDAnalysis.coordinates.memory import MemoryReader
 
@@ -220,11 +216,9 @@ def reweighting(differences_kj_mol: npt.ArrayLike, temperature_k: float) -> tupl
 
 
 def frame_weights(path: str | Path) -> Float64Array:
-    """Return the weights `(n_frames,)` of a trajectory's frames at equilibrium; ones where the file has none.
-
-    All replicas of one answer share a scale, mean 1 over all their frames: concatenate them as the frames. Raises
-    TrajectoryError for a damaged file, or one that has grown since the weights were written.
-    """
+    """Return the weights `(n_frames,)` of a trajectory's frames at equilibrium; ones where the file has none. All
+    replicas of one answer share a scale, mean 1 over all their frames: concatenate them as the frames. Raises
+    TrajectoryError for a damaged file, or one that has grown since the weights were written."""
     with open_trajectory(path) as reader:
         weights, n_frames = reader.weights, reader.n_frames
     if weights is None:

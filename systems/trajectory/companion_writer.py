@@ -21,11 +21,8 @@ POSITIONS_ALONE = (".dcd", ".xtc")
 
 
 def pdb_text(scene: Scene) -> str:
-    """Return PDB text (ASCII) in the scene's atom order, with CONECT records for all bonds.
-
-    A scene too far from the origin for the columns is centred. Raises InputError above 99,999 atoms (the format's
-    limit).
-    """
+    """Return PDB text (ASCII) in the scene's atom order, with CONECT records for all bonds. A scene too far from the
+    origin for the columns is centred. Raises InputError above 99,999 atoms (the format's limit)."""
     if scene.n_atoms > MOST_ATOMS:
         raise InputError(f"Scene {scene.name!r} has {scene.n_atoms} atoms; a PDB file holds at most {MOST_ATOMS:,}.")
     angstrom = scene.positions_nm * 10.0

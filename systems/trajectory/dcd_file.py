@@ -49,11 +49,8 @@ _LIKELY_DEG = (40.0, 140.0)
 
 
 class DcdLayout:
-    """Where the frames of a DCD lie, and what its header says. Sizes in bytes.
-
-    `interval_ps` between frames is 1 where no time step is stated. Raises TrajectoryError when the header is damaged or
-    of a kind that is not supported.
-    """
+    """Where the frames of a DCD lie, and what its header says. Sizes in bytes. `interval_ps` between frames is 1 where
+    no time step is stated. Raises TrajectoryError when the header is damaged or of a kind that is not supported."""
 
     def __init__(self, path: Path) -> None:
         try:
@@ -108,10 +105,8 @@ class DcdLayout:
         return self.first_frame_at + frame * self.frame_dtype.itemsize
 
     def whole_frames(self) -> int:
-        """Return the number of frames in the file. Raises TrajectoryError when it ends inside one or lacks some.
-
-        Other programs write the number they intend (or 0) and never correct it, so theirs is only warned about.
-        """
+        """Return the number of frames in the file. Raises TrajectoryError when it ends inside one or lacks some. Other
+        programs write the number they intend (or 0) and never correct it, so theirs is only warned about."""
         n, rest = divmod(self.file_bytes - self.first_frame_at, self.frame_dtype.itemsize)
         stated = self.n_frames_stated
         if rest or (stated not in (0, n) and self.has_our_title):
@@ -125,10 +120,8 @@ class DcdLayout:
 
 
 def step_fields(times_ps: Float64Array, record: dict[str, Any]) -> tuple[int, int, float]:
-    """Return `(first step, steps between frames, time step in ps)` for the header.
-
-    In units of the integration step where the record states one that divides the times, else of the interval.
-    """
+    """Return `(first step, steps between frames, time step in ps)` for the header. In units of the integration step
+    where the record states one that divides the times, else of the interval."""
     stated = record.get("save_every_ps")
     if len(times_ps) > 1:
         interval = float(times_ps[1] - times_ps[0])
@@ -247,11 +240,9 @@ class DcdWriter(CompanionWriter):
 
 
 class DcdReader(CompanionReader):
-    """Reads our DCD files with their companions, and plain ones (32-bit, no fixed atoms) of other programs.
-
-    Without companions times come from the header (1 ps a frame where it states no time step) and `scene` from `top`.
-    Raises TrajectoryError when the file is cut short or damaged, InputError where `top` is needed and does not fit.
-    """
+    """Reads our DCD files with their companions, and plain ones (32-bit, no fixed atoms) of other programs. Without
+    companions times come from the header (1 ps a frame where it states no time step) and `scene` from `top`. Raises
+    TrajectoryError when the file is cut short or damaged, InputError where `top` is needed and does not fit."""
 
     def __init__(self, path: Path, top: Path | None) -> None:
         super().__init__(path)

@@ -10,7 +10,6 @@ from __future__ import annotations
 import bz2
 import contextlib
 import gzip
-import importlib
 import itertools
 import re
 import tempfile
@@ -30,7 +29,6 @@ from systems.scene import IntArray
 from systems.trajectory.base import TrajectoryReader
 from systems.trajectory.foreign_scenes import (
     NONE,
-    Format,
     bonds_completed,
     format_of,
     named_scene,
@@ -43,13 +41,6 @@ from systems.trajectory.store import Float32Array, Float64Array
 _NM = 0.1
 # Magic, atoms, step, time, nine numbers of the cell, atoms again; then the precision, a float32.
 _XTC_PRECISION = 56
-
-
-def unit_note(format_: Format) -> tuple[str, ...]:
-    """Return the line on a unit of length that a format does not state, none where it states one."""
-    if not format_.unit_taken:
-        return ()
-    return (f"a {format_.name} file states no unit of length; {format_.unit_taken} is taken.",)
 
 
 def counted_note(time_ps: Float64Array) -> tuple[str, ...]:
@@ -107,15 +98,13 @@ class _InMemory(TrajectoryReader):
 
 
 class MdtrajReader(_InMemory):
-    """A format that MDTraj reads, whole into memory.
-
-    Raises TrajectoryError for what MDTraj cannot read, InputError when `top` is needed or does not fit.
-    """
+    """A format that MDTraj reads, whole into memory. Raises TrajectoryError for what MDTraj cannot read, InputError
+    when `top` is needed or does not fit."""
 
     def __init__(self, path: Path, top: Path | None) -> None:
         super().__init__(path)
         self._format = format_of(path)
-        self.notes = unit_note(self._format)
+        self.notes = self._format.notes
         stated = None if top is None else scene_from_structure(top, name=path.stem)
         whole = self._load(None if stated is None or self._format.names_atoms else stated.to_mdtraj_topology())
         self._positions = np.asarray(whole.xyz, dtype=np.float32)
@@ -140,13 +129,8 @@ class MdtrajReader(_InMemory):
         if n_molecules > 1:
             raise InputError(f"{path} holds {n_molecules} molecules, of which MDTraj reads the first; write PDB.")
         try:
-            if is_mol2:
-                importlib.import_module("pandas")
             with _ascii_path(path) as seen:
                 return mdtraj.load(str(seen), **({} if topology is None else {"top": topology}))
-        except ImportError as error:
-            lacking = error.name or "a package"
-            raise TrajectoryError(f"{path} cannot be read: MDTraj needs {lacking}, which is not installed.") from error
         except Exception as error:  # each MDTraj reader raises errors of its own
             needs = topology is None and not self._format.names_atoms
             hint = " (a format without topology: give one with `top`)" if needs else ""
@@ -169,11 +153,9 @@ class MdtrajReader(_InMemory):
 
 
 class StreamReader(TrajectoryReader):
-    """An XTC or TRR file of another program, or a NetCDF file of Amber's convention, read by MDTraj block by block.
-
-    TRR frames without positions are left out. Raises TrajectoryError for what it cannot read, InputError when `top`
-    does not fit.
-    """
+    """An XTC or TRR file of another program, or a NetCDF file of Amber's convention, read by MDTraj block by block. TRR
+    frames without positions are left out. Raises TrajectoryError for what it cannot read, InputError when `top` does
+    not fit."""
 
     def __init__(self, path: Path, top: Path | None) -> None:
         import mdtraj
@@ -290,7 +272,7 @@ class MdanalysisReader(TrajectoryReader):
 
         super().__init__(path)
         self._format = format_of(path)
-        self.notes = unit_note(self._format)
+        self.notes = self._format.notes
         self._kept: IntArray | None = None
         stated = None
         if top is not None:
@@ -317,9 +299,7 @@ class MdanalysisReader(TrajectoryReader):
 
     def _times(self) -> tuple[Float64Array, bool]:
         """Return times `(n_frames,)` ps and whether the file states them; frames without positions are left out.
-
-        MDAnalysis' own time step of 1 ps is none: only formats that state times are asked for them.
-        """
+        MDAnalysis' own time step of 1 ps is none: only formats that state times are asked for them."""
         known = self._format.times != NONE
         times, has = np.arange(self.n_frames, dtype=np.float64), np.ones(self.n_frames, dtype=bool)
         for k, frame in enumerate(self._reader):
@@ -369,11 +349,8 @@ class _Frame(NamedTuple):
 
 class AtomsReader(_InMemory):
     """Reads an XYZ file, or one of ASE's `Trajectory`, whole into memory; names or elements are the file's, bonds found
-    by distance.
-
-    Raises TrajectoryError for a damaged file, one of changing atoms, or where ase is not installed; InputError for a
-    `top` that does not fit.
-    """
+    by distance. Raises TrajectoryError for a damaged file, one of changing atoms, or where ase is not installed;
+    InputError for a `top` that does not fit."""
 
     def __init__(self, path: Path, top: Path | None) -> None:
         super().__init__(path)

@@ -51,12 +51,9 @@ EVERY, SOME, NONE = "stated", "where stated", "no"
 
 @dataclass(frozen=True)
 class Format:
-    """One format, as the manual's table has it (docs/files.md), which also says what its library makes up.
-
-    `times`: EVERY, SOME or NONE, as files state them. `names_atoms`: whether it needs no `top`.
-    `unit_taken`: the unit that is taken, with a line, where nothing states one. `mda`: MDAnalysis' name of it, where
-    the suffix does not say.
-    """
+    """One format, as the manual's table has it (docs/files.md), which also says what its library makes up. `times`:
+    EVERY, SOME or NONE, as files state them. `names_atoms`: whether it needs no `top`. `unit_taken`: the unit that is
+    taken, with a line, where nothing states one. `mda`: MDAnalysis' name of it, where the suffix does not say."""
 
     name: str
     suffixes: tuple[str, ...]
@@ -65,6 +62,11 @@ class Format:
     names_atoms: bool
     unit_taken: str = ""
     mda: str | None = None
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        said = f"a {self.name} file states no unit of length; {self.unit_taken} is taken."
+        return (said,) if self.unit_taken else ()
 
 
 XYZ_SUFFIXES = (".xyz", ".extxyz", ".xyz.gz", ".xyz.bz2", ".extxyz.gz")
@@ -126,10 +128,8 @@ def scene_from_mdtraj_topology(
     elements: Sequence[str] | None = None,
 ) -> Scene:
     """Return a Scene with the atoms, bonds and bond orders of an `mdtraj.Topology`, at positions `(n_atoms, 3)` nm.
-
     `elements` replaces the topology's. Where no bond order is stated, orders and charges are perceived; they stay 0
-    where the bonds fit no valence (missing hydrogens). Raises InputError when the numbers of atoms differ.
-    """
+    where the bonds fit no valence (missing hydrogens). Raises InputError when the numbers of atoms differ."""
     positions = np.array(positions_nm, dtype=np.float64)
     if positions.shape != (topology.n_atoms, 3):
         raise InputError(f"{source or name}: {topology.n_atoms} atoms in the topology, positions {positions.shape}.")
@@ -188,15 +188,8 @@ def scene_from_structure(top: Path, *, name: str) -> Scene:
     """
     import mdtraj
 
-    suffix = top.suffix.lower()
-    if top.name.lower().endswith(XYZ_SUFFIXES):
-        from systems.trajectory.foreign_readers import AtomsReader
-
-        made = AtomsReader(top, None).scene
-        assert made is not None
-        return replace(made, name=name)
-    if format_of(top).reader != "MDTraj" and suffix not in (".h5", ".hdf5"):
-        if suffix in (".psf", ".prmtop", ".parm7", ".top"):
+    if not is_mdtraj_format(top) or top.suffix.lower() in (".xyz", ".gsd"):
+        if top.suffix.lower() in (".psf", ".prmtop", ".parm7", ".top"):
             with contextlib.suppress(Exception):  # MDAnalysis is asked next, and says what is wrong
                 bare = mdtraj.load_topology(str(top))
                 return scene_from_mdtraj_topology(bare, np.zeros((bare.n_atoms, 3)), name=name, source=top.name)
@@ -218,14 +211,12 @@ def scene_from_structure(top: Path, *, name: str) -> Scene:
 
 
 def scene_from_universe(top: Path, *, name: str) -> Scene:
-    """Return the Scene of a topology that MDAnalysis reads (TPR, GSD, LAMMPS data, ...).
-
-    Bonds are the file's, or by covalent radii where it holds none; positions are zero where it holds none. Raises
-    InputError when it cannot be read, or an element is not known.
-    """
+    """Return the Scene of a topology that MDAnalysis reads (TPR, GSD, XYZ, LAMMPS data, ...). Bonds are the file's, or
+    by covalent radii where it holds none; positions are zero where it holds none. Raises InputError when it cannot be
+    read, or an element is not known."""
     import MDAnalysis
 
-    format_ = format_of(top).mda
+    format_ = "XYZ" if top.suffix.lower() == ".extxyz" else format_of(top).mda
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
@@ -244,7 +235,9 @@ def scene_from_universe(top: Path, *, name: str) -> Scene:
     written = [str(x) for x in _values(atoms, "elements", [""] * len(atoms))]
     elements = []
     for i, (atom, element) in enumerate(zip(names, written, strict=True)):
-        symbol = element_symbol(atom, residues[of_atom[i]], element)
+        # XYZ files hold symbols or PDB names: CA in capitals is an alpha carbon, which MDAnalysis takes for calcium.
+        guessed = "xyz" in top.suffix.lower() and len(element) == 2 and atom.isupper() and atom not in ("CL", "BR")
+        symbol = element_symbol(atom, residues[of_atom[i]], "" if guessed else element)
         if symbol is None:
             raise InputError(f"{top}: the element of atom {i} ({atom}) is not known; give a PDB file with `top`.")
         elements.append(symbol)
@@ -252,9 +245,13 @@ def scene_from_universe(top: Path, *, name: str) -> Scene:
     if hasattr(atoms, "bonds"):
         bonds = np.unique(np.sort(np.asarray(atoms.bonds.to_indices()).reshape(-1, 2), axis=1), axis=0).astype(np.int64)
     ids = [str(x) for x in _values(atoms.residues, "resids", range(1, len(residues) + 1))]
-    scene = named_scene(top, names, elements, positions, residue_of_atom=of_atom, residue_names=residues,
-                        residue_ids=ids, bonds=bonds)  # fmt: skip
-    return replace(scene, name=name)
+    scene = _scene_of_names(top, names, elements, positions, of_atom, residues, ids, bonds)
+    return with_orders(with_bonds_by_distance(replace(scene, name=name)))
+
+
+def is_mdtraj_format(path: Path) -> bool:
+    """Whether MDTraj has a reader for files of this suffix."""
+    return format_of(path).reader in ("MDTraj", "surromd")
 
 
 def named_scene(
@@ -262,32 +259,41 @@ def named_scene(
     names: Sequence[str],
     elements: Sequence[str],
     positions_nm: npt.ArrayLike,
-    cell_nm: npt.ArrayLike | None = None,
-    *,
-    residue_of_atom: IntArray | None = None,
-    residue_names: Sequence[str] = ("MOL",),
-    residue_ids: Sequence[str] = ("1",),
-    bonds: IntArray | None = None,
+    cell_nm: npt.ArrayLike | None,
 ) -> Scene:
-    """Return the Scene of atoms that a file only names, one chain; bonds by distance where it states none, across the
-    cell `(3, 3)` nm too, orders by valence."""
-    n, rows = len(elements), np.empty((0, 2), dtype=np.int64) if bonds is None else bonds
-    scene = Scene(
+    """Return the Scene of atoms that a file only names, one residue; bonds by distance, across the cell `(3, 3)` nm
+    too, orders by valence."""
+    one, no_bonds = np.zeros(len(elements), dtype=np.int64), np.empty((0, 2), dtype=np.int64)
+    scene = _scene_of_names(path, names, elements, positions_nm, one, ["MOL"], ["1"], no_bonds)
+    return with_orders(with_bonds_by_distance(scene, cell_nm))
+
+
+def _scene_of_names(
+    path: Path,
+    names: Sequence[str],
+    elements: Sequence[str],
+    positions_nm: npt.ArrayLike,
+    residue_of_atom: IntArray,
+    residue_names: Sequence[str],
+    residue_ids: Sequence[str],
+    bonds: IntArray,
+) -> Scene:
+    """Return the Scene of one chain; bond orders and charges are 0."""
+    return Scene(
         name=path.stem,
         atom_names=tuple(names),
         elements=tuple(elements),
-        residue_of_atom=np.zeros(n, dtype=np.int64) if residue_of_atom is None else residue_of_atom,
+        residue_of_atom=residue_of_atom,
         residue_names=tuple(residue_names),
         residue_ids=tuple(residue_ids),
         chain_of_residue=("A",) * len(residue_names),
-        bonds=rows,
-        bond_orders=np.zeros(len(rows)),
-        formal_charges=np.zeros(n, dtype=np.int64),
+        bonds=bonds,
+        bond_orders=np.zeros(len(bonds)),
+        formal_charges=np.zeros(len(elements), dtype=np.int64),
         masses_da=np.array([atomic_weight_da(e) for e in elements]),
         positions_nm=np.asarray(positions_nm, dtype=np.float64),
         provenance={"source": path.name},
     )
-    return with_orders(with_bonds_by_distance(scene, cell_nm))
 
 
 def _mass_da(symbol: str, atom: Any) -> float:

@@ -122,10 +122,8 @@ class Hdf5Writer(TrajectoryWriter):
 
 
 class Hdf5Reader(TrajectoryReader):
-    """Reads our own HDF5 trajectories and MDTraj's. `top` gives the bonds to a topology of MDTraj's without any.
-
-    Raises TrajectoryError when the file is damaged or incomplete, InputError when `top` does not fit.
-    """
+    """Reads our own HDF5 trajectories and MDTraj's. `top` gives the bonds to a topology of MDTraj's without any. Raises
+    TrajectoryError when the file is damaged or incomplete, InputError when `top` does not fit."""
 
     # Of its unit of length.
     _nm = 1.0
@@ -214,11 +212,9 @@ class Hdf5Reader(TrajectoryReader):
 
 
 class H5mdReader(Hdf5Reader):
-    """Reads the positions of another program's H5MD file. Times that are fixed steps are not used.
-
-    Raises TrajectoryError for a file that is damaged or lacks units, InputError for several groups of particles or a
-    `top` that does not fit.
-    """
+    """Reads the positions of another program's H5MD file. Times that are fixed steps are not used. Raises
+    TrajectoryError for a file that is damaged or lacks units, InputError for several groups of particles or a `top`
+    that does not fit."""
 
     def _read_headers(self, top: Path | None) -> None:
         groups = [g for g in self._file.get("particles", {}).values() if "position/value" in g]

@@ -61,10 +61,8 @@ def join(paths: Sequence[Path], out: Path, *, overwrite: bool = False) -> Path:
 
 
 def replicas_of(record: Mapping[str, Any], n_frames: int) -> list[tuple[slice, dict[str, Any]]]:
-    """Return the frames of each replica in a file and what it says of itself: of one that is not joined, all.
-
-    Raises TrajectoryError where the record does not fit the file.
-    """
+    """Return the frames of each replica in a file and what it says of itself: of one that is not joined, all. Raises
+    TrajectoryError where the record does not fit the file."""
     if KEY not in record:
         return [(slice(0, n_frames), dict(record))]
     found, at = [], 0

@@ -108,10 +108,8 @@ class Record(TypedDict, total=False):
 
 @dataclass(frozen=True, eq=False)
 class FrameBlock:
-    """Frames that belong together, checked: positions `(n, n_atoms, 3)` nm, series `(n,)`.
-
-    Where they are kept: `per_atom` velocities and forces `(n, n_atoms, 3)` by name, box vectors `(n, 3, 3)` nm.
-    """
+    """Frames that belong together, checked: positions `(n, n_atoms, 3)` nm, series `(n,)`. Where they are kept:
+    `per_atom` velocities and forces `(n, n_atoms, 3)` by name, box vectors `(n, 3, 3)` nm."""
 
     positions_nm: Float32Array
     time_ps: Float64Array
@@ -223,12 +221,9 @@ def create_store(
     overwrite: bool,
     run_id: str = "",
 ) -> None:
-    """Create the file with all headers and no frames; it appears under its name only when it is whole.
-
-    `lay_out` adds the format's own groups and columns, `columns` names velocities and forces where frames have them,
-    `run_id` says whose file it is. Raises TrajectoryError when it exists, InputError for a record that is not JSON,
-    StorageError.
-    """
+    """Create the file with all headers and no frames; it appears under its name only when it is whole. `lay_out` adds
+    the format's own groups and columns, `columns` names velocities and forces where frames have them, `run_id` says
+    whose file it is. Raises TrajectoryError when it exists, InputError for a record that is not JSON, StorageError."""
     refuse_existing(path, overwrite)
     image = io.BytesIO()
     with h5py.File(image, "w") as file:
@@ -250,9 +245,7 @@ def create_store(
 
 def open_hdf5(path: Path, source: AtomicFile | None = None) -> h5py.File:
     """Open an HDF5 file: to read, as it was before a transaction that did not end, or through `source`, to write.
-
-    Raises TrajectoryError, in one line, when it is absent, cut short or no HDF5 file.
-    """
+    Raises TrajectoryError, in one line, when it is absent, cut short or no HDF5 file."""
     if not path.exists():
         raise TrajectoryError(f"{path} does not exist.")
     seen: Any = source or path
@@ -281,10 +274,8 @@ def column_names(file: h5py.File) -> list[str]:
 
 
 def consistent_length(file: h5py.File, path: Path) -> int:
-    """Return the number of frames that every column holds.
-
-    Raises TrajectoryError where they differ, and for blocks of data that are missing.
-    """
+    """Return the number of frames that every column holds. Raises TrajectoryError where they differ, and for blocks of
+    data that are missing."""
     columns = {name: file[name] for name in column_names(file)}
     lengths = {name: int(column.shape[0]) for name, column in columns.items()}
     n_frames = min(lengths.values())
@@ -331,10 +322,8 @@ def read_run_id(file: h5py.File) -> str:
 
 
 class FrameStore:
-    """Appends to a file made by `create_store`, one transaction per append.
-
-    Raises TrajectoryError when the file is damaged or not ours (this version's), StorageError.
-    """
+    """Appends to a file made by `create_store`, one transaction per append. Raises TrajectoryError when the file is
+    damaged or not ours (this version's), StorageError."""
 
     def __init__(self, path: Path) -> None:
         self.path = self._file_path = path
@@ -400,10 +389,8 @@ class FrameStore:
             return self._columns["time"][:], scalars
 
     def _store(self, block: FrameBlock, columns: Columns, stored: Columns) -> None:
-        """Append a block and the format's own `columns` (by dataset name). Raises InputError, StorageError.
-
-        `stored`: what has a checksum, as it is on disk: positions `(n, n_atoms, 3)` as FRAMES, and more by name.
-        """
+        """Append a block and the format's own `columns` (by dataset name). Raises InputError, StorageError. `stored`:
+        what has a checksum, as it is on disk: positions `(n, n_atoms, 3)` as FRAMES, and more by name."""
         with self._open():
             n, start = len(block), self.n_frames
             values: dict[str, Any] = {"time": block.time_ps, "surromd/chunk_idx": block.chunk_idx, **columns}

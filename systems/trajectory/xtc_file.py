@@ -41,9 +41,7 @@ from systems.trajectory.store import (
 
 class CompanionWriter(TrajectoryWriter):
     """Writes frames and their companions; see `systems.trajectory.codec.open_writer` for the arguments and errors.
-
-    Frames go to the file first and to `NAME.meta.h5` then: what lies behind the frames that it counts was in flight.
-    """
+    Frames go to the file first and to `NAME.meta.h5` then: what lies behind the frames that it counts was in flight."""
 
     _fd = -1
 
@@ -70,9 +68,7 @@ class CompanionWriter(TrajectoryWriter):
     @abstractmethod
     def _encoded(self, block: FrameBlock) -> tuple[bytes, Columns, Columns]:
         """Return a block as the file has it, the columns that go with it, and what has a checksum (`FrameStore`).
-
-        Raises InputError for frames that the format cannot hold.
-        """
+        Raises InputError for frames that the format cannot hold."""
 
     @abstractmethod
     def _offset(self, n_frames: int, record: h5py.File) -> int:
@@ -201,10 +197,8 @@ class XtcWriter(CompanionWriter):
 
 
 class XtcReader(CompanionReader):
-    """Reads our XTC files with their companions; those of other programs MDTraj reads (`foreign_readers`).
-
-    Raises TrajectoryError when the file is cut short or damaged.
-    """
+    """Reads our XTC files with their companions; those of other programs MDTraj reads (`foreign_readers`). Raises
+    TrajectoryError when the file is cut short or damaged."""
 
     def __init__(self, path: Path, top: Path | None) -> None:
         super().__init__(path)
@@ -253,10 +247,8 @@ def _compressed(block: FrameBlock, steps: npt.NDArray[np.int32]) -> tuple[bytes,
 
 
 def _decompressed(data: bytes, n_frames: int, path: Path, first: int) -> tuple[Float32Array, Float32Array]:
-    """Return positions `(n_frames, n_atoms, 3)` and box vectors `(n_frames, 3, 3)` nm of frames' bytes.
-
-    Raises TrajectoryError, which says where in `path`, when they are damaged.
-    """
+    """Return positions `(n_frames, n_atoms, 3)` and box vectors `(n_frames, 3, 3)` nm of frames' bytes. Raises
+    TrajectoryError, which says where in `path`, when they are damaged."""
     from mdtraj.formats import XTCTrajectoryFile
 
     with _scratch() as copy:

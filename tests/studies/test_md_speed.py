@@ -30,7 +30,7 @@ def test_unequal_models_are_seen() -> None:
     """Negative control of the comparison: another force field, and another solvent."""
     ala = next(c for c in study.CASES if c.scene == "alanine-dipeptide" and c.solvent == "obc2")
     scene = ala.prepared()
-    mine = study.ours(ala, scene, cores=1)
+    mine = study.ours(ala, scene)
     mine.context.setPositions(scene.positions_nm)
     for other in (ala, study.Case("x", ala.scene, "vacuum"), study.Case("x", ala.scene, "obc2", "ff99SB-ILDN")):
         found = study._compare({"ours": mine, "plain, one a core": study.plain(scene, other.spec(), threads=1)})

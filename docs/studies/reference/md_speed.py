@@ -146,10 +146,10 @@ def plain_system(scene: Scene, spec: ForceFieldSpec) -> Any:
 
     rigid = {"constraints": app.HBonds}
     if spec.force_field == "gaff2":
-        from md_reference.forces.gaff import load_openmm, parameters
+        from md_reference.forces import gaff
 
         implicit = {"implicitSolvent": app.OBC2} if spec.solvent == "obc2" else {}
-        return load_openmm(parameters(scene)).createSystem(nonbondedMethod=app.NoCutoff, **rigid, **implicit)
+        return gaff.entry(scene).system(scene, nonbondedMethod=app.NoCutoff, **rigid, **implicit)
     files = [PROTEIN_FILES[spec.force_field]]
     box: dict[str, Any] = {"nonbondedMethod": app.NoCutoff}
     if spec.solvent == "obc2":

@@ -425,6 +425,8 @@ class LamSlideTrainer(arch.Trainer):
         model: LamSlideConfig = settings.model
         start = None if request.start_from is None else load_weights(request.start_from)
         frames = references.frames(canonical=model.canonical)
+        for validation in (False, True):  # too short a reference is refused before anything is said
+            frames.window_starts(model.approximator.chunk_frames, validation=validation)
         share_one = 0.0 if start is not None else STAGE_ONE_SHARE
 
         def run(advance: arch.AdvanceFn) -> Path:

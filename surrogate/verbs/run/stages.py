@@ -166,10 +166,10 @@ def _starts(site: Site, record: RunRecord, config: MDConfig, files: list[Path]) 
         with suppress(SimulationError):
             frames = frames_over_states(rolled, 2 * len(files), seed=site.options.seed)
             in_time = _until(frames, _STARTING * decision.seconds("held-out md"))
-            return list(frames_as_starts(site.scene, config, in_time, len(files)).scenes), config
+            return list(frames_as_starts(site.scene, config, in_time, len(files))[0]), config
     # On one core, while the others wait.
     hot_ps = min(HOT_PS, 1.2 * config.equilibrate_ps / rates.cores)
-    return list(many_starts(site.scene, config, len(files), hot_ps=hot_ps).scenes), config
+    return list(many_starts(site.scene, config, len(files), hot_ps=hot_ps)[0]), config
 
 
 def _until(frames: npt.NDArray[np.float32], seconds: float) -> Iterator[npt.NDArray[np.float32]]:

@@ -35,22 +35,22 @@ def angles(scenes: tuple[Scene, ...]) -> np.ndarray:
 
 
 def test_starts_are_many_states_of_the_same_molecule() -> None:
-    found = many_starts(SCENE, conditions(), 20)
-    positions = np.stack([s.positions_nm for s in found.scenes])
-    assert len(found.scenes) == 20 and "20 starts" in found.how
+    scenes, how = many_starts(SCENE, conditions(), 20)
+    positions = np.stack([s.positions_nm for s in scenes])
+    assert len(scenes) == 20 and "20 starts" in how
     assert not (check_frames(positions, geometry_from_scene(SCENE)) & (CHIRALITY | OMEGA)).any()
     psi = np.degrees(torsion(positions, np.asarray(backbone_torsions(SCENE)["psi"])))[:, 0]
     helical = (psi > -120) & (psi < 80)
     assert 0 < helical.sum() < 20
-    assert {s.topology_hash for s in found.scenes} == {SCENE.topology_hash}
+    assert {s.topology_hash for s in scenes} == {SCENE.topology_hash}
 
 
 def test_a_start_is_a_function_of_its_place_and_the_seed() -> None:
-    few, many = many_starts(SCENE, conditions(), 4), many_starts(SCENE, conditions(), 18)
-    for one, other in zip(few.scenes, many.scenes, strict=False):
+    (few, _), (many, _) = many_starts(SCENE, conditions(), 4), many_starts(SCENE, conditions(), 18)
+    for one, other in zip(few, many, strict=False):
         np.testing.assert_array_equal(one.positions_nm, other.positions_nm)
-    again = many_starts(SCENE, replace(conditions(), seed=4), 4)
-    assert np.abs(angles(again.scenes)[1:] - angles(few.scenes)[1:]).max() > 0.1
+    again, _ = many_starts(SCENE, replace(conditions(), seed=4), 4)
+    assert np.abs(angles(again)[1:] - angles(few)[1:]).max() > 0.1
 
 
 def test_without_simd_openmm_heats(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -58,25 +58,25 @@ def test_without_simd_openmm_heats(monkeypatch: pytest.MonkeyPatch) -> None:
         raise SimdUnavailableError("no compiler")
 
     monkeypatch.setattr(starts, "SimdReplicas", unavailable)
-    found = many_starts(SCENE, conditions(), 3)
-    assert "OpenMM" in found.how
-    assert np.abs(angles(found.scenes)[1:] - angles(found.scenes)[0]).max() > 0.1
+    scenes, how = many_starts(SCENE, conditions(), 3)
+    assert "OpenMM" in how
+    assert np.abs(angles(scenes)[1:] - angles(scenes)[0]).max() > 0.1
 
 
 def test_what_cannot_turn_begins_in_one_structure() -> None:
     from systems.library.named_scenes import prepare
 
     methane = prepare("smiles:C")
-    found = many_starts(methane, conditions(methane), 3)
-    assert "one structure" in found.how and "no torsion" in found.how
-    assert all(s is methane for s in found.scenes)
+    scenes, how = many_starts(methane, conditions(methane), 3)
+    assert "one structure" in how and "no torsion" in how
+    assert all(s is methane for s in scenes)
 
 
 def test_frames_that_are_another_molecule_are_no_starts() -> None:
     mirrored = SCENE.positions_nm * np.array([-1.0, 1.0, 1.0])
     frames = np.stack([mirrored, SCENE.positions_nm, np.full_like(mirrored, np.nan)])
-    found = frames_as_starts(SCENE, conditions(), frames, 4)
-    assert found.how.startswith("1 starts") and len(found.scenes) == 4
+    scenes, how = frames_as_starts(SCENE, conditions(), frames, 4)
+    assert how.startswith("1 starts") and len(scenes) == 4
     with pytest.raises(SimulationError, match="none of 1"):
         frames_as_starts(SCENE, conditions(), mirrored[None], 1)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -130,6 +131,55 @@ def test_states_hold_what_was_asked_for(simulation: Simulation, alanine_dipeptid
             getattr(simulation.context.getState(positions=True, velocities=True, forces=True, energy=True), getter)()
     with pytest.raises(SimulationError, match="no energy to minimise"):
         simulation.minimizeEnergy()
+
+
+@pytest.mark.parametrize("where", ["path", "file"])
+def test_a_checkpoint_continues_bit_for_bit(
+    tmp_path: Path, simulation: Simulation, small_weights: Weights, alanine_dipeptide: Scene, where: str
+) -> None:
+    simulation.step(10)  # within the second chunk
+    target: Any = tmp_path / "state.chk" if where == "path" else io.BytesIO()
+    simulation.saveCheckpoint(target)
+    simulation.step(9)
+    expected = simulation.positions_nm
+    other = Simulation(alanine_dipeptide, small_weights, seed=5, solver_steps=2, precision="fp32")
+    if where == "file":
+        target.seek(0)
+    other.loadCheckpoint(target)
+    assert other.currentStep == 10
+    other.step(9)
+    assert np.array_equal(other.positions_nm, expected)
+    assert not np.array_equal(expected, simulation.scene.positions_nm)
+
+
+def test_openmm_checkpoint_reporter(tmp_path: Path, simulation: Simulation) -> None:
+    from openmm import app
+
+    path = str(tmp_path / "last.chk")
+    simulation.reporters.append(app.CheckpointReporter(path, 6))
+    simulation.step(8)
+    at_eight = simulation.positions_nm
+    simulation.loadCheckpoint(path)
+    assert simulation.currentStep == 6
+    simulation.step(2)
+    assert np.array_equal(simulation.positions_nm, at_eight)
+
+
+def test_foreign_and_damaged_checkpoints_are_refused(
+    tmp_path: Path, simulation: Simulation, small_weights: Weights, alanine_dipeptide: Scene
+) -> None:
+    path = tmp_path / "state.chk"
+    simulation.step(4)
+    simulation.saveCheckpoint(path)
+    other = Simulation(alanine_dipeptide, small_weights, seed=6, solver_steps=2, precision="fp32")
+    with pytest.raises(InputError, match="saved with seed = 5, not seed = 6"):
+        other.loadCheckpoint(path)
+    data = path.read_bytes()
+    for broken in (data[: len(data) // 2], b"", b"not a zip", data[:200] + bytes(8) + data[208:]):
+        path.write_bytes(broken)
+        with pytest.raises(InputError, match="cannot be read as a checkpoint"):
+            simulation.loadCheckpoint(path)
+    assert simulation.currentStep == 4
 
 
 def test_positions_can_be_set_and_other_molecules_are_refused(

@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 
 from systems.chemistry.geometry import superposition, torsion
-from systems.chemistry.residues import amino_acid_names, template_for
+from systems.chemistry.residues import ONE_LETTER, template_for
 from systems.errors import PreparationError
 from systems.library.named_scenes import prepare
 from systems.prepare import repair
 from systems.prepare.repair import _conformers, _tree, residue_shape, resolve_side_chains
 
 
-@pytest.mark.parametrize("name", [n for n in amino_acid_names() if n not in ("GLY", "ALA", "PRO")])
+@pytest.mark.parametrize("name", [n for n in ONE_LETTER.values() if n not in ("GLY", "ALA", "PRO")])
 def test_every_conformer_has_the_template_s_bonds_and_torsions_at_rotamers(name: str) -> None:
     shape, moved, template = residue_shape(name), list(_tree(name)), template_for(name)
     assert template is not None
