@@ -37,7 +37,7 @@ def parse_hydrogen_mass_da(text: str, what: str = "hydrogen mass") -> float | No
 class WaterBox:
     """The periodic cell of water that a scene is put into where the solvent is explicit. Raises InputError."""
 
-    padding_nm: float = option("Distance between periodic images in explicit water.", 1.0, within=(0.3, 10.0))
+    padding_nm: float = option("Least distance between the solute and its periodic images.", 1.0, within=(0.3, 10.0))
     ionic_strength_molar: float = option(
         "NaCl concentration in explicit water, beyond counter-ions.", 0.0, within=(0.0, 5.0)
     )

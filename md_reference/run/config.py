@@ -45,11 +45,15 @@ class MDConfig(Conditions):
 
     time_ps: float = option("Simulated time, such as 10ns.")
     save_every_ps: float = option("Interval between saved frames.", 1.0)
-    equilibrate_ps: float = option("Equilibration time before the first saved frame.", 100.0)
-    starts: str = option(
-        "Where replicas begin: many states, from hot MD, or one structure.", "many", choices=("many", "one")
+    equilibrate_ps: float = option(
+        "Equilibration of each replica before the first saved frame, beyond the time.", 100.0
     )
-    keep: str = option("Atoms written from explicit water: solute, all or auto (solute on platform simd).", "auto")
+    starts: str = option(
+        "Initial structures of replicas: many (diverse, from hot MD) or one (the input structure).",
+        "many",
+        choices=("many", "one"),
+    )
+    keep: str = option("Atoms to save in explicit water: solute, all or auto (all; solute on platform simd).", "auto")
     save_velocities: bool = option("Save velocities (.h5 only).", False)
     save_forces: bool = option("Save forces (.h5 only).", False)
 

@@ -150,7 +150,9 @@ def _config_option(known: Iterable[Option]) -> Any:
     """Return `--config`, whose help names the tables of the file."""
     tables = dict.fromkeys(found.section or found.name for found in known if found.section or found.kind is dict)
     listed = "".join(f", [{table}]" for table in tables)
-    return typer.Option("--config", help=literal(f"TOML of these options{listed}; what is given here comes first."))
+    return typer.Option(
+        "--config", help=literal(f"TOML file of these options{listed}; the command line takes precedence.")
+    )
 
 
 def _resolved(kind: type, given: dict[str, Any]) -> Any:
@@ -308,7 +310,7 @@ def systems(
 @app.command()
 @with_options
 def plan(scene: SceneArg, *, options: PlanOptions, as_json: JsonOpt = False) -> None:
-    """Show what a reference run of SCENE will do, what it skips and how long it takes."""
+    """Show platform, settings and speed of a reference run of SCENE, and with --time its wall time."""
     print_pairs(sm.plan(scene, options=options), as_json=as_json)
 
 
@@ -365,7 +367,7 @@ def windows(
     options: WindowsOptions,
     as_json: JsonOpt = False,
 ) -> None:
-    """Convert reference trajectories into one compact training file."""
+    """Pack reference trajectories into one training file (superposed, 16-bit)."""
     print_written([sm.windows(references, out, options=options)], as_json, options.quiet)
 
 

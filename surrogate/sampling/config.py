@@ -28,12 +28,12 @@ class RolloutConfig:
     time_ps: float = option("Simulated time, such as 100ns.")
     save_every_ps: float | None = option("Interval between saved frames.", None, unset="that of the weights")
     lag_ps: float | None = option(
-        "Time step of the surrogate, for weights trained at several.",
+        "Lag time of a surrogate step, for weights trained at several.",
         None,
         unset="the longest that the save interval is a multiple of",
     )
     guard: str = option(
-        "What to do with invalid frames: flag, resample, repair (minimise with OpenMM) or fallback (MD instead).",
+        "Action on invalid frames: flag, resample (the chunk), repair (minimise with OpenMM), fallback (MD instead), off.",
         "flag",
         choices=GUARDS,
     )

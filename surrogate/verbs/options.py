@@ -72,7 +72,9 @@ class MDSettings:
     """What the MD is and how it is run: fields of MDConfig, ForceFieldSpec and WaterBox. What is left open (None) is
     resolved for the scene: by the protocol that is asked for, else by its default there."""
 
-    protocol: str | None = option("Settings of a published protocol: md17, md22, mdgen, fast-folders.", None)
+    protocol: str | None = option(
+        "Conditions of a published data set, with our force fields: md17, md22, mdgen, fast-folders.", None
+    )
     force_field: str | None = from_field(ForceFieldSpec, "force_field", None, unset="auto")
     solvent: str | None = from_field(ForceFieldSpec, "solvent", None, unset="auto")
     level: str | None = option(
@@ -143,12 +145,12 @@ class CompareOptions(Overwriting):
 
     replicate: Trajectories | None = option("Independent reference run, for the replicate baseline.", None)
     top: PathLike | Sequence[PathLike | None] | None = option(
-        "Topology file: one for all, or one each for REF, every TRAJ and the replicate.",
+        "Topology file: once for all, or repeated in the order REF, TRAJ, ..., replicate ('-' for none).",
         None,
         read=lambda text, what: None if text == "-" else text,
     )
     dt_ps: float | Sequence[float | None] | None = option(
-        "Time between frames, where a file does not say; as the topology. '-' leaves one out.",
+        "Time between frames, such as 10ps, instead of the file's; once for all, or repeated as the topology is.",
         None,
         read=lambda text, what: None if text == "-" else parse_time_ps(text, what),
     )
@@ -177,10 +179,8 @@ class TrainOptions(Validated, Seeded, Resuming, Overwriting, Quiet):
     level: str | None = option("Train a potential on forces at this level of theory: gfn2-xtb.", None)
     budget_s: float | None = option("Wall-time budget, such as 30min.", None)
     steps: int | None = option("Number of optimiser steps, instead of a budget.", None, within=(1, None))
-    start_from: str | Path | None = option(
-        "Weights to fine-tune (second stage): a name or a file.", None, words=("from",)
-    )
-    longest_lag_ps: float | None = option("Longest frame spacing to learn, such as 1ns.", None)
+    start_from: str | Path | None = option("Pretrained weights to fine-tune: a name or a file.", None, words=("from",))
+    longest_lag_ps: float | None = option("Learn all lag times up to this one, such as 1ns.", None)
     device: str = option("Compute device.", "auto", choices=("auto", "cpu", "cuda"))
     model: dict[str, Any] | None = option("Settings of the network, as explained.", None, words=None)
     training: dict[str, Any] | None = option("Settings of its training, as explained.", None, words=None)
@@ -192,7 +192,9 @@ class RunOptions(MDSettings, Preparation, OnDask, Seeded, Resuming, Overwriting,
 
     budget_s: float = option("Total wall-time budget, such as 1h.", 600.0)
     way: str = option(
-        "Method: MD, a surrogate, or the more accurate of the two (auto).", "auto", choices=("auto", "md", "surrogate")
+        "Method: md, surrogate (it finds the states, MD weighs them) or auto (least expected error).",
+        "auto",
+        choices=("auto", "md", "surrogate"),
     )
     weights: str | Path | None = option(
         "Name of shipped weights, or a .safetensors file.", None, unset="those that cover SCENE"

@@ -57,7 +57,7 @@ def reference(scene: str | Path | Scene, out: str | Path, options: ReferenceOpti
 
     `force_field`, `solvent`: see `md_reference.forces.forcefield.ForceFieldSpec`; `level='gfn2-xtb'` is that force
     field. Explicit solvents ('tip3p', 'opc') put a scene that has no periodic cell into one: water to `padding_nm` (1
-    nm) on each side, counter-ions, and NaCl at `ionic_strength_molar` (0), drawn with `seed`.
+    nm) between the solute and its images, counter-ions, and NaCl at `ionic_strength_molar` (0), drawn with `seed`.
 
     `out` ends in .h5, .dcd or .xtc; with several replicas NAME.h5 becomes NAME_r0.h5, NAME_r1.h5, ..., with seeds
     `seed`, `seed + 1`, ..., and `join` writes them into NAME.h5, too, one after another, whose record says where each

@@ -40,6 +40,8 @@ def standard_peptide(scene: Scene) -> tuple[Scene, npt.NDArray[np.int64]]:
     between their usual ends.
     """
     names = [template.name if (template := template_for(name)) else name for name in scene.residue_names]
+    if not any(map(template_for, scene.residue_names)):
+        raise InputError(f"{scene.name} is no chain of amino acids.")
     hydrogens = sum(element == "H" for element in scene.elements)
     refusal = ""
     for forms in list(product(*(_FORMS.get(name, (name,)) for name in names)))[:_MOST_TRIED]:
