@@ -33,7 +33,7 @@ class RolloutConfig:
         unset="the longest that the save interval is a multiple of",
     )
     guard: str = option(
-        "Action on invalid frames: flag, resample (the chunk), repair (minimise with OpenMM), fallback (MD instead), off.",
+        "Action on invalid frames: flag, resample (the chunk), repair (by OpenMM), fallback (MD instead) or off.",
         "flag",
         choices=GUARDS,
     )
