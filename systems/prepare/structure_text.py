@@ -110,8 +110,6 @@ def _add_header(structure: Any, found: StructureFile) -> None:
 
 def _read_pdb(text: str, path: Path) -> StructureFile:
     """Return the first model of the first structure. Raises InputError for an atom record that is not in columns."""
-    import gemmi
-
     found = StructureFile([])
     index_of: dict[str, int] = {}
     repeated: set[str] = set()
@@ -162,7 +160,10 @@ def _read_pdb(text: str, path: Path) -> StructureFile:
     if ignored:
         found.notes.append(f"{ignored} CONECT entries name no single atom of the file and are ignored")
     found.conect = sorted(pairs)
-    _add_header(gemmi.read_pdb_string("\n".join([*header, ""])), found)
+    if header:
+        import gemmi
+
+        _add_header(gemmi.read_pdb_string("\n".join([*header, ""])), found)
     return found
 
 
