@@ -307,7 +307,8 @@ DOORS = {
     r"np\.load(txt)?\(": ("systems/files/outside.py",),
     r"gzip\.(open|decompress)\b": ("systems/chemistry/residues.py", "systems/trajectory/foreign_readers.py"),
     r"json\.loads?\(": ("systems/files/schema.py",),
-    r"tomllib\.loads?\(": ("surrogate/models/architecture.py",),
+    # The package's own tables.
+    r"tomllib\.loads?\(": ("systems/chemistry/residues.py", "systems/library/named_scenes.py"),
 }
 # Benches read what they wrote themselves, in a folder of their own.
 _OWN = ("surrogate/bench/", "docs/")
