@@ -254,7 +254,7 @@ def test_power_cut_of_a_real_file_system(kind: Kind, tmp_path: Path) -> None:
         run.start()
         rng = np.random.default_rng(0)
         while run.is_alive() and len(cuts) < 40:
-            time.sleep(float(rng.uniform(0.0, 0.06)))
+            time.sleep(float(rng.uniform(0.0, 0.02)))
             with suppress(ProcessLookupError):
                 os.kill(run.pid or 0, signal.SIGSTOP)
                 cuts.append(tmp_path / f"{len(cuts)}.img")
