@@ -1,8 +1,8 @@
 """Other programs, which do not outlive this process, whatever ends it: AmberTools.
 
 Each is guarded by a shell that holds the other end of a pipe. When this process ends, by `kill -9` too, the pipe
-closes, and the guard kills the program with all that it has started. A guard has a session of its own, so that a
-terminal's Ctrl-C and hang-up do not reach it.
+closes, and the guard kills the program with all that it has started, or removes the folder. A guard has a session of
+its own, so that a terminal's Ctrl-C and hang-up do not reach it.
 """
 
 from __future__ import annotations
@@ -30,6 +30,8 @@ _RUN = (
     "exec 3<&0 </dev/null; { trap '' HUP INT TERM; read -r _ <&3; kill -KILL 0; } 2>/dev/null & "
     '"$@" 3<&-; status=$?; kill -KILL $! 2>/dev/null; wait $! 2>/dev/null; exit $status'
 )
+# What is killed at the same moment may still be writing into the folder: some seconds of patience.
+_REMOVE = "trap '' HUP INT TERM; read -r _; for _ in 1 2 3 4 5 6 7 8 9; do rm -rf -- \"$1\" && exit; sleep 1; done"
 
 
 def run_program(command: list[str], folder: Path, environment: Mapping[str, str]) -> tuple[int, str]:
@@ -64,14 +66,16 @@ def run_program(command: list[str], folder: Path, environment: Mapping[str, str]
 
 @contextmanager
 def scratch_folder(prefix: str) -> Iterator[Path]:
-    """Yield a new folder among the system's temporary ones, which goes with the block. Raises StorageError where it
-    cannot be made."""
+    """Yield a new folder among the system's temporary ones, which goes with the block, and with this process. Raises
+    StorageError where it cannot be made."""
     try:
         folder = tempfile.TemporaryDirectory(prefix=prefix, ignore_cleanup_errors=True)
     except OSError as error:
         raise StorageError(f"no temporary folder can be made: {error}; free space or set TMPDIR.") from error
     with folder as name:
-        yield Path(name)
+        guard = ["/bin/sh", "-c", _REMOVE, "surromd-guard", name]
+        with subprocess.Popen(guard, stdin=subprocess.PIPE, stderr=subprocess.DEVNULL, start_new_session=True):
+            yield Path(name)
 
 
 # ---- AmberTools as installed here -----------------------------------------------------------------------------------

@@ -67,8 +67,7 @@ def test_nothing_is_left_of_charges_being_computed(
     assert "Traceback" not in said
     wait_until(lambda: not runs(sqm), "sqm outlives the verb")
     wait_until(lambda: not processes_with(mark), f"there remain {processes_with(mark)}")
-    if number != signal.SIGKILL:  # which leaves nobody to remove the scratch folder
-        wait_until(lambda: not list((tmp_path / "tmp").glob("surromd-*")), "the folder is left")
+    wait_until(lambda: not list((tmp_path / "tmp").glob("surromd-*")), "the folder is left")
     assert not (tmp_path / "x.h5").exists()
 
 
