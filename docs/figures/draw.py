@@ -69,8 +69,8 @@ def draw_effective(table: dict[str, Any], out: Path) -> None:
         xscale="log",
         xlabel="effective samples of cos ψ a processor second (one core)",
         ylabel="Jensen-Shannon distance of φ/ψ maps",
-        ylim=(0, 0.27),
-        xlim=(0.015, 2500),
+        ylim=(0, 0.52),
+        xlim=(0.8, 2500),
     )
     axes.legend(frameon=False, fontsize=8, loc="lower left")
     figure.savefig(out, metadata={"Date": None})

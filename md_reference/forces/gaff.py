@@ -339,8 +339,8 @@ def expected_s(n_atoms: int) -> float:
 
 
 def announce(scene: Scene) -> None:
-    """Say how long a molecule's charges will take, where it is worth saying: a warning of the logger 'surromd.charges',
-    on stderr unless a program that uses this package decides else."""
+    """Say how long a molecule's charges will take, if more than a moment: a warning of the logger 'surromd.charges', on
+    stderr unless a program that uses this package decides else."""
     if (expected := expected_s(scene.n_atoms)) >= _WORTH_SAYING_S:
         about = format_wall(float(f"{expected:.1g}"))
         what = f"AM1-BCC charges of {scene.n_atoms} atoms, about {about} on an idle core, once: they are kept"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import platform as machine
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -22,11 +23,9 @@ def machine_name() -> str:
     import openmm
 
     model = machine.processor()
-    try:
+    with suppress(OSError):
         lines = Path("/proc/cpuinfo").read_text().splitlines()
         model = next((line.partition(":")[2].strip() for line in lines if line.startswith("model name")), model)
-    except OSError:
-        pass
     return " | ".join([machine.machine(), model, f"{os.cpu_count()} cores", openmm.__version__, *platforms()])
 
 
@@ -63,7 +62,7 @@ REFERENCE_MAX_ATOMS_BORN = 55
 REFERENCE_MAX_ATOMS_VACUUM = 100
 # Below this a step is too short for a GPU: launching its kernels costs more than the forces.
 GPU_MIN_ATOMS = 500
-# From here on the CPU platform's threads are worth it; below, a second one only waits for the first.
+# From this size on the CPU platform's threads pay; below, a second one only waits for the first.
 _THREADS_MIN_ATOMS = 1000
 _DEVICES = ("CUDA", "HIP", "OpenCL")
 

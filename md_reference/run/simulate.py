@@ -138,7 +138,7 @@ class StoredRun:
             check_same_run(self.stand.config, config, outs[0])
             if self.header.get("steps_into_frame") or self.header.get("equilibrated_steps") is not None:
                 chk = checkpoint_path(outs[0])
-                raise InputError(f"{chk} stands inside a frame, as an earlier version left it; start with `overwrite`.")
+                raise InputError(f"{chk} is between two frames, of an earlier version; start with `overwrite`.")
         self.began = time.monotonic()
         self.done = int(self.header["files"][0]["n_frames"])
         solute = config.kept_atoms(scene)
@@ -166,7 +166,7 @@ class StoredRun:
         write_checkpoint(checkpoint_path(self.outs[0]), self.header, blob)
 
     def save(self) -> None:
-        """Write the checkpoint, which stands at the last frame."""
+        """Write the checkpoint of the last frame."""
         raise NotImplementedError
 
     def frame(self) -> Any:

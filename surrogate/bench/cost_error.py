@@ -141,7 +141,7 @@ def run_cost_error(
     fitted = [_fitted(w, reference, config.lag_ps) for w in weights]
     result = _earlier(folder, {"references": prints[0], "config": asdict(config)})
     scene = fitted[0].domain.scene
-    scenes = {w.domain.scene.topology_hash: w.domain.scene for w in fitted}  # atoms may stand in another order
+    scenes = {w.domain.scene.topology_hash: w.domain.scene for w in fitted}  # atom orders may differ
     report("reading the references")
     references = {hashed: read_reference(of, reference, replicate, config.lag_ps) for hashed, of in scenes.items()}
     ref = references[scene.topology_hash]

@@ -322,7 +322,7 @@ def reference(scene: SceneArg, *, out: OutOpt, options: ReferenceOptions, as_jso
 
 
 _CAMPAIGN = (
-    "An example of FILE, of two scenes at two temperatures (every setting of `reference` may stand in it):",
+    "An example of FILE, of two scenes at two temperatures (every setting of `reference` is allowed):",
     'scenes = ["alanine-dipeptide", "pdb/*.pdb"]',
     'temperatures = ["300K", "350K"]',
     "replicas = 4",

@@ -71,7 +71,7 @@ def cautions_of(inputs: ComparisonInput, correlation: float, start: str = "") ->
 
 
 def evaluated_rows(rows: Sequence[Row], options: Options) -> tuple[Row, ...]:
-    """Return the rows with corrected p-values (Holm over all rows) and a word each; what the words mean stands in the
+    """Return the rows with corrected p-values (Holm over all rows) and a word each; what the words mean is in the
     report's definitions."""
     corrected = holm([math.nan if r.form == "share" else r.p_value for r in rows])
     evaluated = [

@@ -84,6 +84,12 @@ class ChunkSampler:
         self._fit = fitted_atoms(template)
         self._target = template.positions_nm - template.positions_nm[self._fit].mean(axis=0)
 
+    def at(self, temperature_k: float) -> ChunkSampler:
+        """Return this sampler of a potential at another temperature of constant volume."""
+        other = copy.copy(self)
+        other._model = cast(Potential, self._model).in_bath({"temperature_k": temperature_k, "ensemble": "nvt"})
+        return other
+
     @property
     def n_conditioning(self) -> int:
         """Frames that a chunk is conditioned on."""
@@ -463,7 +469,7 @@ class Interventions:
 
     def _resolve(self, row: int, attempt: int) -> bool:
         """Do what the guard says about a row that was just drawn; return whether it can stay as it is then. A first
-        draw without a frame that passes is not worth it: there is another."""
+        draw without a frame that passes is a waste: there is another."""
         bad = np.flatnonzero(caught(self.chunk.flags[row]))
         if not len(bad):
             self.state.tallies[row].md_in_a_row = 0

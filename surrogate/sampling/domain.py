@@ -291,8 +291,7 @@ def _compare(
 
 
 def _compare_start(scene: Scene, order: npt.NDArray[np.int64], geometry: Geometry) -> list[Deviation]:
-    flags = _flags_of_start(scene.positions_nm[order], geometry)
-    if not flags:
+    if not (flags := _flags_of_start(scene.positions_nm[order], geometry)):
         return []
     reason = f"the starting structure is no frame of the training reference ({', '.join(flag_names(flags))})"
     return [Deviation("start", reason, forcible=not flags & NOT_FINITE)]

@@ -138,7 +138,7 @@ def progress_of(path: Path, state: checkpoint.Checkpoint, settings: dict[str, An
 
 # Record of a rollout: settings, provenance and summary in its files, and the lines shown while it runs.
 
-# Options that stand in a part of the record.
+# Options that belong to a part of the record.
 _OF_INTERVENTIONS, _OF_SELECTION = ("guard", "energy_every"), ("atoms", "select")
 
 
@@ -426,11 +426,12 @@ def _start(plan: Plan, sampler: ChunkSampler, n_replicas: int, asked_to_stop: Ca
     frames = np.broadcast_to(start, (n_replicas, sampler.n_conditioning, *start.shape)).copy()
     began = time.monotonic()
     if plan.config.anneal_ps:
-        frames = _annealed(plan, frames, asked_to_stop)
+        frames = _annealed(plan, sampler, frames, asked_to_stop)
     return Progress(frames, wall_s=time.monotonic() - began, tallies=[Tally() for _ in range(n_replicas)])
 
 
-def _annealed(plan: Plan, start: npt.NDArray[np.float32], asked_to_stop: Callable[[], bool]) -> npt.NDArray[np.float32]:
+def _annealed(plan: Plan, usual: ChunkSampler, start: npt.NDArray[np.float32],
+              asked_to_stop: Callable[[], bool]) -> npt.NDArray[np.float32]:  # fmt: skip
     """Return where replicas `(replicas, n_conditioning, n_atoms, 3)` nm of a potential come to rest after MD at a high
     temperature that falls to theirs; one that flies apart on the way starts as it was."""
     config, frames = plan.weights.model.config, start
@@ -438,7 +439,7 @@ def _annealed(plan: Plan, start: npt.NDArray[np.float32], asked_to_stop: Callabl
     stages = [falling[0]] * (HOT_STAGES - 1) + list(falling)
     chunks = max(1, round(plan.config.anneal_ps / len(stages) / (config.n_new * config.lag_ps)))
     for stage, temperature_k in enumerate(stages):
-        sampler = ChunkSampler(in_bath(plan.weights, {"temperature_k": float(temperature_k), "ensemble": "nvt"}))
+        sampler = usual.at(float(temperature_k))
         velocities = None
         for k in range(chunks):
             if asked_to_stop():

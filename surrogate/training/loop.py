@@ -147,7 +147,7 @@ def tensor_checksum(text: str, tensors: Mapping[str, torch.Tensor]) -> str:
 
 
 def save_tensors(path: Path, kind: str, record: dict[str, Any], tensors: Mapping[str, Tensor], **more: str) -> None:
-    """Write tensors with their record, which stands in the metadata under the name `kind`, whole or not at all."""
+    """Write tensors with their record, in the metadata under the name `kind`, whole or not at all."""
     from safetensors.torch import save_file
 
     kept = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}

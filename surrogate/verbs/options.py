@@ -119,7 +119,9 @@ class RolloutOptions(RolloutConfig, Joining, Preparation, Resuming, Overwriting,
 
 @dataclass(frozen=True, kw_only=True)
 class OnDask:
-    workers: int | None = option("Number of local worker processes.", None, within=(1, None), unset="one per core")
+    workers: int | None = option(
+        "Number of local processes, if several scenes run.", None, within=(1, None), unset="one per core"
+    )
     scheduler: str | None = option("Address of a Dask scheduler, such as tcp://host:8786.", None)
 
 

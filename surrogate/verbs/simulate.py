@@ -164,7 +164,7 @@ def rollout(
     Every frame is checked as it is made against what the training reference does. `guard` says what is done about one
     that fails: 'flag' marks it, 'resample' draws the chunk again, 'repair' relaxes it with OpenMM, 'fallback' runs real
     MD from the last valid frame ('off': marked, and nothing stops the run). A learned potential's energy is compared
-    with the reference's at every `energy_every`-th frame. What was done stands in the record (`interventions`) and in a
+    with the reference's at every `energy_every`-th frame. What was done is in the record (`interventions`) and in a
     column, frame by frame. `select` (MDTraj's language) and `atoms` ('all', 'heavy') say which atoms are written.
     `force` rolls a scene that leaves the training domain where that is possible. `temperature_k` is refused
     unless it is that of the weights; a learned potential takes any, and `friction_per_ps`, `timestep_ps`,

@@ -147,6 +147,8 @@ def explain_training(references: Trajectories, options: TrainOptions) -> str:
     """
     from surrogate.models.architecture import toml_text
 
+    if options.level is not None:
+        raise InputError("`explain` is for trainings on trajectories; leave `level` out.")
     asked = _asked(options, Path("explained.safetensors"))
     trainer, _, asked, lines = _plan(references, options.validation, asked, explained=True)
     tables = trainer.settings(asked).tables()

@@ -6,6 +6,7 @@ import json
 import re
 import types
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import MISSING, fields, is_dataclass
 from functools import cache
 from typing import (
@@ -160,14 +161,12 @@ def _array(value: Any, kind: type[Any], where: str) -> Any:
     """Return nested lists as an array of float64 (or of a kind of integers)."""
     kind = get_origin(kind) or kind
     whole = issubclass(kind, np.integer)
-    try:
+    with suppress(ValueError, TypeError, OverflowError):
         found = np.asarray(value)
         if found.ndim and (found.dtype.kind in ("iu" if whole else "iuf") or not found.size):
             found = np.array(found, dtype=np.float64 if kind is np.floating else kind)
             if np.isfinite(found).all():
                 return found
-    except (ValueError, TypeError, OverflowError):
-        pass
     raise ValueError(f"{where} must be an array of {'whole' if whole else 'finite'} numbers")
 
 

@@ -155,9 +155,8 @@ def refuse_changed(before: Handedness, after: Handedness) -> None:
 
 def say_inverted(found: Handedness, notes: list[str]) -> None:
     """Note the residues that are not L, flat, or the other diastereomer at CB, as the file has them."""
-    flat = "flat stereocentres, as the file has them"
     for centre, words in (("CA", "D-residues, as the file has them"), ("CB", "the other diastereomer at CB")):
-        for sign, said in ((-1, words), (0, flat)):
+        for sign, said in ((-1, words), (0, f"flat at {centre}, as the file has them")):
             if names := [label for (label, atom), of in found.items() if atom == centre and of == sign]:
                 notes.append(f"{said}: {listed(names)}")
 

@@ -29,12 +29,11 @@ def join(paths: Sequence[Path], out: Path, *, overwrite: bool = False) -> Path:
     with ExitStack() as stack:
         readers = [stack.enter_context(open_trajectory(path)) for path in paths]
         first, scene = readers[0], readers[0].scene
-        if scene is None:
-            raise InputError(f"{first.path} holds no topology; it cannot be joined.")
-        for reader in readers[1:]:
-            if reader.scene is None:
+        for reader in readers:
+            if reader.scene is None or scene is None:
                 raise InputError(f"{reader.path} holds no topology; it cannot be joined.")
             check_same_topology(reader.path, reader.scene, scene)
+        assert scene is not None
         intervals = [float(np.median(np.diff(r.time_ps))) for r in readers if r.n_frames > 1]
         interval_ps = intervals[0] if intervals else float(first.record.get("save_every_ps", 1.0))
         if not np.allclose(intervals, interval_ps, rtol=1e-6):

@@ -23,7 +23,7 @@ from typing import Any
 INTERRUPTED, FAILED = 130, 1
 LONGEST_S = 120.0  # that any step of it may take on a busy machine
 CHUNKS_UNTIL_STOPPED = 6
-PATIENCE_S = 10.0
+PATIENCE_S = 2.0
 UNDER_WAY = "under way"
 
 

@@ -4,7 +4,7 @@
 
 For each pair of contact classes the nearest distance of all frames, 0.8 of it, the limit, and which atoms of which
 molecule came so near; then the share of each molecule's frames that the limits call a clash, which MD at 300 K should
-have none of. Files of one molecule stand beside each other: a folder's trajectories, or one file.
+have none of. All files of one folder are of one molecule.
 """
 
 from __future__ import annotations

@@ -133,14 +133,12 @@ def render(comparison: Comparison, template: str = PAGE, *, command: str, forewo
         severity=_SEVERITY.index,
         command=command if template == PAGE else Markup(command.replace("`", "'")),
         foreword=foreword,
-        embed=lambda value: Markup(_embed(value)),
+        # JSON inside a script element: nothing in it can end that element or start another.
+        embed=lambda value: Markup(
+            json.dumps(value, allow_nan=False, separators=(",", ":")).replace("<", "\\u003c").replace("&", "\\u0026")
+        ),
         joined=joined,
     )
-
-
-def _embed(value: object) -> str:
-    """Return JSON that may stand inside a script element: nothing in it can end that element or start another."""
-    return json.dumps(value, allow_nan=False, separators=(",", ":")).replace("<", "\\u003c").replace("&", "\\u0026")
 
 
 def escaped(value: str) -> str:

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from surrogate.data import References, StrideSampler, Survey, TrainingFrames, strides_up_to
+from surrogate.data import References, StrideSampler, TrainingFrames, strides_up_to
 from surrogate.models import architecture as arch
 from surrogate.models.lam_slide import flow
 from surrogate.models.lam_slide.model import AutoencoderConfig, LamSlide, LamSlideConfig, draw_identifiers
@@ -440,8 +440,7 @@ class LamSlideTrainer(arch.Trainer):
         return arch.Prepared(frames.scene.name, run)
 
 
-def _suits(survey: Survey) -> tuple[int, str] | None:
-    return (0, "one molecule") if len(survey.scenes) == 1 and not survey.unseen else None
-
-
-LAM_SLIDE = arch.Architecture("lam-slide", LamSlideConfig.from_dict, LamSlide, LamSlideTrainer, _suits)
+LAM_SLIDE = arch.Architecture(
+    "lam-slide", LamSlideConfig.from_dict, LamSlide, LamSlideTrainer,
+    lambda survey: (0, "one molecule") if len(survey.scenes) == 1 and not survey.unseen else None,
+)  # fmt: skip

@@ -24,7 +24,7 @@ class Plan(NamedTuple):
 
 # MD without a surrogate is compared with itself: it is split by replicas, or by stages if there is one replica.
 PLANS: dict[Way, Plan] = {
-    "md": Plan("MD for the whole budget, from many starts", {"md": 1.0}),
+    "md": Plan("MD for the whole budget", {"md": 1.0}),
     "rollout": Plan("a rollout finds the states, MD from its frames weighs them", {"rollout": 0.1, "held-out md": 0.9}),
     "potential": Plan(
         "a potential that learns from GFN2-xTB finds the states, MD weighs them",

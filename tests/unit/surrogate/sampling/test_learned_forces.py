@@ -124,17 +124,18 @@ def test_annealed_replicas_start_all_over(tmp_path: Path, monkeypatch: pytest.Mo
         turned = np.rad2deg(mdtraj.compute_dihedrals(run, [methyl])[:, 0])
         return (turned[1:] - turned[0] + 180.0) % 360.0 - 180.0
 
-    def bath_of(weights: Weights, bath: dict[str, Any]) -> Weights:
-        asked.append(bath.get("temperature_k", 0.0))
-        return in_bath(weights, bath)
+    at = runner.ChunkSampler.at
 
-    monkeypatch.setattr(runner, "in_bath", bath_of)
+    def at_asked(self: Any, temperature_k: float) -> Any:
+        asked.append(temperature_k)
+        return at(self, temperature_k)
+
+    monkeypatch.setattr(runner.ChunkSampler, "at", at_asked)
     still = rolled("still", 0.0)
     assert np.abs(still).max() < 60.0
-    turned = rolled("turned", 10.0)
+    turned = rolled("turned", 4.0)
     assert np.abs(turned).max() > 90.0
-    hot = [kelvin for kelvin in asked if kelvin]
-    assert hot[:3] == [600.0] * 3 and hot[-1] == pytest.approx(300.0) and (np.diff(hot[2:]) < 0.0).all()
+    assert asked[:3] == [600.0] * 3 and asked[-1] == pytest.approx(300.0) and (np.diff(asked[2:]) < 0.0).all()
     # One that flies apart starts as it was.
     draw = runner.ChunkSampler.draw
     calls = iter(range(100))
@@ -146,7 +147,7 @@ def test_annealed_replicas_start_all_over(tmp_path: Path, monkeypatch: pytest.Mo
         return drawn
 
     monkeypatch.setattr(runner.ChunkSampler, "draw", flying)
-    lost = rolled("lost", 10.0)
+    lost = rolled("lost", 4.0)
     assert abs(lost[1]) < 60.0
     assert abs(lost[0] - turned[0]) < 1e-3
     other = weights(Painet(PainetConfig(n_new=2, width=16)))

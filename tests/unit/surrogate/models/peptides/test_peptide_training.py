@@ -311,7 +311,7 @@ def test_a_flow_is_taught_to_end_in_two_evaluations_where_it_ended_in_six(
 ) -> None:
     """Nearer than its own two steps come, with the same probabilities of states; the weights say how many steps they
     take."""
-    training = PeptideTraining(steps=150, batch=32, learning_rate=3e-3, validate_every_s=1e9)
+    training = PeptideTraining(steps=80, batch=32, learning_rate=3e-3, validate_every_s=1e9)
     start = train_peptides([frames], tmp_path / "a.safetensors", SMALL, training)
     labeller = load_weights(start)
     apart = {}
