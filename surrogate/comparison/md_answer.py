@@ -273,7 +273,7 @@ def _tests(found: Equilibrium, ps: float) -> str:
     holds = "within errors" if found.ck_holds else "beyond errors"
     return (
         f"a reversible Markov model at a lag of {format_time_ps(found.lag_frames * ps, 2)} (timescales {flat}, "
-        f"Chapman-Kolmogorov off by {found.ck_error:.2g}, {holds}, {found.crossings} crossings of the slowest process)"
+        f"Chapman-Kolmogorov off by {found.ck_error:.2g}, {holds}; crossings of the slowest process: {found.crossings})"
     )
 
 

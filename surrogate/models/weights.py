@@ -72,7 +72,8 @@ class TrainingDomain:
             more = f" and {len(names) - 6} more" if len(names) > 6 else ""
             what = f"{len(names)} molecules ({', '.join(names[:6])}{more})"
         what += " and molecules like them" if self.transferable else ""
-        return f"{what}, {c.get('force_field')}/{c.get('solvent')}, {c.get('temperature_k')} K, frames {lags} ps apart"
+        md = f"{f}/{c.get('solvent')}, {c.get('temperature_k')} K" if (f := c.get("force_field")) else "unknown MD"
+        return f"{what}, {md}, frames {lags} ps apart"
 
 
 @dataclass(frozen=True)

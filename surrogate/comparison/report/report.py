@@ -233,7 +233,7 @@ def state_lines(found: Convergence) -> list[tuple[str, ...]]:
             format_time_ps(s.relaxation_ps, 2) if math.isfinite(s.relaxation_ps) else "–",
             f"{s.entries}, {s.exits}" if is_state else "",
             f"{s.left} of {s.started}" if is_state else "",
-            f"{100 * s.low:.2g} to {100 * s.high:.2g} %" if is_state else "",
+            f"{100 * s.low:.2g} to {100 * s.high:.3g} %" if is_state else "",
         ))  # fmt: skip
     return out
 
