@@ -208,7 +208,7 @@ def per_day(ns_per_day: float | None) -> str:
     """Return a speed, or that it is not recorded."""
     if ns_per_day is None:
         return "not recorded"
-    return f"{ns_per_day / 1000:.3g} µs/day" if ns_per_day >= 1000 else f"{ns_per_day:.3g} ns/day"
+    return f"{float(f'{ns_per_day / 1e3:.3g}'):,g} µs/day" if ns_per_day >= 1e3 else f"{ns_per_day:.3g} ns/day"
 
 
 STATE_HEADS = ("State", "Share", "By quarters of each replica", "Drift, p", "Split R-hat", "Relaxes in", "In, out",
