@@ -9,6 +9,7 @@ import md_speed as study
 import pytest
 
 
+@pytest.mark.slow
 def test_the_benchmark_compares_equal_models(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "bench.json"
     study.main(["--case", "ethanol", "--rounds", "1", "--seconds", "0.05s", "--cores", "1", "-o", str(out)])

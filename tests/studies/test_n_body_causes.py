@@ -32,6 +32,7 @@ NAMES = (
 )
 
 
+@pytest.mark.slow
 def test_every_kind_of_line_is_measured(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(study, "CODE_STEPS", 2)
     data = make_systems("n-body-charged", range(4))

@@ -331,6 +331,7 @@ def test_the_whole_way_prints_our_rows_under_the_published(tmp_path: Path) -> No
         assert (one.method, one.ade, one.fde) == (other.method, other.ade, other.fde)
 
 
+@pytest.mark.slow
 def test_md17_goes_the_whole_way_to_the_table(tmp_path: Path) -> None:
     settings = Settings(tmp_path, budget_s=None, steps=3, solver_steps=2)
     asked = {"train": 20, "validation": 8, "test": 8}
@@ -361,7 +362,10 @@ def test_md17_goes_the_whole_way_to_the_table(tmp_path: Path) -> None:
         assert (row.ade, row.fde) == (by_name[row.method].ade, by_name[row.method].fde)
 
 
-@pytest.mark.parametrize(("form", "more_than"), [("--paper-size", 5_000_000), ("--paper-form", 1_500_000)])
+@pytest.mark.parametrize(
+    ("form", "more_than"),
+    [pytest.param("--paper-size", 5_000_000, marks=pytest.mark.slow), ("--paper-form", 1_500_000)],
+)
 def test_the_paper_size_and_form_run_in_calls_until_their_epochs_are_done(
     form: str, more_than: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -34,6 +34,7 @@ def shipped() -> Weights:
     return load_weights(weights_path(SHIPPED))
 
 
+@pytest.mark.slow
 def test_profiles_tell_right_weights_from_shaken_ones(shipped: Weights, tmp_path: Path) -> None:
     right = torsion_profiles.rows(SHIPPED)
     assert [row[1] for row in right] == ["H11-C0-C1-O2", "C1-N3-C4-C5", "C6-C7-O8-H17"]
@@ -190,6 +191,7 @@ def test_states_of_a_torsion_are_counted(monkeypatch: pytest.MonkeyPatch, capsys
     assert capsys.readouterr().out == "2 trajectories: 75 ± 25 % of frames, 2 crossings\n"
 
 
+@pytest.mark.slow
 def test_a_rival_learns_what_it_is_shown() -> None:
     scene = scene_from_smiles("O")
     molecule, rng = Molecule.of(scene), np.random.default_rng(0)

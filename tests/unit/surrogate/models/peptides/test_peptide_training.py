@@ -306,6 +306,7 @@ def test_what_goes_on_from_weights_takes_their_configuration(tmp_path: Path, fra
         sm.explain_training([tmp_path / "ref.h5"], arch="lam-slide", start_from=out, steps=2)
 
 
+@pytest.mark.slow
 def test_a_flow_is_taught_to_end_in_two_evaluations_where_it_ended_in_six(
     tmp_path: Path, frames: TrainingFrames
 ) -> None:
