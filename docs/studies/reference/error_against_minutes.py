@@ -64,7 +64,7 @@ MOLECULES = {
     "free-GLY-VAL": ("sequence:GLY-VAL", 200),
     "free-ALA-TYR": ("sequence:ALA-TYR", 120),
     "VAL-SER-GLU-PHE": ("sequence:ACE-VAL-SER-GLU-PHE-NME", 60),
-    "lidocaine": ("smiles:CCN(CC)CC(=O)Nc1c(C)cccc1C", 500),
+    "lidocaine": ("smiles:CCN(CC)CC(=O)Nc1c(C)cccc1C", 700),
     "clopidogrel": ("smiles:COC(=O)[C@H](c1ccccc1Cl)N1CCc2sccc2C1", 900),
     "metoprolol": ("smiles:COCCc1ccc(OC[C@@H](O)CNC(C)C)cc1", 300),
     "chignolin": ("chignolin", 0),
