@@ -76,7 +76,7 @@ def weights(tmp_path_factory: pytest.TempPathFactory, small_weights: Weights) ->
     return load_weights(out)
 
 
-def test_a_true_rollout_is_equivalent_time_its_length_and_a_wrong_one_little(
+def test_a_true_rollout_is_equivalent_to_its_length_and_a_wrong_one_to_little(
     reference: HeldOut, alanine_dipeptide: Scene
 ) -> None:
     frames = toy_frames(alanine_dipeptide, 9, 3_000).astype(np.float64)
@@ -105,7 +105,7 @@ def test_a_true_rollout_is_equivalent_time_its_length_and_a_wrong_one_little(
     assert broken["valid_half_angstrom_%"]["value"] == pytest.approx(90.0)
 
 
-def test_equivalent_time_is_turned_into_seconds_and_never_beyond_the_floor(
+def test_equivalent_time_is_turned_into_seconds_and_never_beyond_the_replicate_baseline(
     reference: HeldOut, alanine_dipeptide: Scene
 ) -> None:
     _, equivalent_time = compare_frames(toy_frames(alanine_dipeptide, 5, 3_000)[None].astype(np.float64), reference)

@@ -51,7 +51,7 @@ STATES = np.full(30, 1 / 30)
 
 
 @pytest.mark.parametrize("n_blocks", [8, 32])
-def test_a_true_sample_is_equivalent_time_its_own_length(n_blocks: int) -> None:
+def test_a_true_sample_is_equivalent_to_its_own_length(n_blocks: int) -> None:
     """Blocks stand for 1 ns each. The mean over trials is within 15 %; the intervals hold it as often as stated."""
     rng = np.random.default_rng(n_blocks)
     found = [measured(draw_counts(STATES, n_blocks, rng), rng, STATES) for _ in range(60)]
@@ -63,7 +63,7 @@ def test_a_true_sample_is_equivalent_time_its_own_length(n_blocks: int) -> None:
     assert np.median(widths) < 6
 
 
-def test_a_biased_sample_is_equivalent_time_the_length_of_its_bias_however_long_it_is() -> None:
+def test_a_biased_sample_is_equivalent_to_the_length_of_its_bias_however_long_it_is() -> None:
     """Divergence eps^2 / 8 of the bias; MD of l frames has (30 - 1) / (8 l). Equal at l = 29 / eps^2."""
     rng = np.random.default_rng(0)
     eps = 0.3
@@ -135,7 +135,7 @@ def evaluated(inputs: tuple[Ensemble, Ensemble, Ensemble]) -> Evaluation:
     return compare(reference, [shorter], replicate, options=Options(peptide_recipe=False)).evaluations[0]
 
 
-def test_the_verdict_says_what_the_trajectory_is_equivalent_time_and_costs(evaluated: Evaluation) -> None:
+def test_the_verdict_says_what_the_trajectory_is_equivalent_to_and_costs(evaluated: Evaluation) -> None:
     by = {w.key: w for w in evaluated.equivalent_time}
     assert list(by) == ["joint_jsd", "psi_correlation"]
     for equivalent_time in by.values():
@@ -151,7 +151,7 @@ def test_the_verdict_says_what_the_trajectory_is_equivalent_time_and_costs(evalu
     assert share == pytest.approx(by["joint_jsd"].equivalent_ps / 12_000 * 1000, rel=0.05)
 
 
-def test_wrong_kinetics_are_equivalent_time_little_where_the_map_is_right(
+def test_wrong_kinetics_are_equivalent_to_little_where_the_map_is_right(
     inputs: tuple[Ensemble, Ensemble, Ensemble],
 ) -> None:
     """Negative control: shuffled frames keep the map's equivalent time and lose that of the kinetics."""
@@ -176,7 +176,7 @@ def test_the_headline_without_costs_or_measures() -> None:
     assert headline([], lambda _: None, 1e3) == ""
 
 
-def test_a_candidate_longer_than_the_md_at_hand_is_charged_for_the_part_that_is_equivalent_time_it() -> None:
+def test_a_candidate_longer_than_the_md_at_hand_is_charged_for_the_part_that_is_equivalent() -> None:
     """As good as MD and sixteen times as long: about a sixteenth is equivalent to all the MD there is, and costs so
     much."""
     rng = np.random.default_rng(11)

@@ -148,7 +148,7 @@ def answer(**more: Any) -> Answer:
     return Answer(**(given | more))
 
 
-def test_the_first_line_says_use_it_or_not_and_the_details_what_it_is_equivalent_time() -> None:
+def test_the_first_line_says_use_it_or_not_and_the_details_what_it_is_equivalent_to() -> None:
     found = told("rollout", equivalent_time(), answer=answer())
     assert found.in_short == (
         "Use MD's answer.",

@@ -243,7 +243,7 @@ def test_files_of_one_frame_are_not_evaluated(tmp_path: Path, monkeypatch: pytes
     assert found["trajectory"] == ["trajectory/md.h5"] and found["held_out"] == ["reference/held_out.h5"]
 
 
-def test_md_that_comparisons_is_made_however_late_it_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_md_to_compare_with_is_made_however_late_it_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(one_scene, "measure", lambda *_: replace(OPENMM, md_ps_per_s=0.01))
     monkeypatch.setitem(stages.STAGES, "report", replace(stages.STAGES["report"], work=evaluated_at_once))
     with monkeypatch.context() as patch:
