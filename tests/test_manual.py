@@ -60,10 +60,11 @@ def test_the_figure_reads_a_table_of_the_sweep(repository: Path) -> None:
         "equivalent_time": {"words": "8.1 ns"}, "times_faster": 5.01,
         "valid_half_angstrom_%": {"value": 99.64}, "bonds_20_percent_%": {"value": 94.63},
     }  # fmt: skip
+    beaten = {"label": "euler 4", "cpu_s_per_ns": {"mean": 0.6}, "jsd": {"value": 0.2, "low": 0.1, "high": 0.3}}
     measured = {
         "config": {"time_ps": 20_000.0, "threads": 1, "lag_ps": None}, "machine": {"name": "mine"},
         "md": {"length_ps": 1e5, "replicate_baseline": 0.058, "errors": [0.6]},
-        "rows": [setting, {"label": "timed", "weights": "w"}],
+        "rows": [setting, setting | beaten, {"label": "timed", "weights": "w"}],
     }  # fmt: skip
     record = from_bench.cost_error(measured)
     assert record["rows"] == [["`fitted`, 3", "0.591", "0.167", "0.26", "8.1 ns", "5.0", "99.64 / 94.63"]]

@@ -85,7 +85,7 @@ class ChunkSampler:
         self._target = template.positions_nm - template.positions_nm[self._fit].mean(axis=0)
 
     def at(self, temperature_k: float) -> ChunkSampler:
-        """Return this sampler of a potential at another temperature of constant volume."""
+        """Return this sampler of a potential at another temperature, in NVT."""
         other = copy.copy(self)
         other._model = cast(Potential, self._model).in_bath({"temperature_k": temperature_k, "ensemble": "nvt"})
         return other

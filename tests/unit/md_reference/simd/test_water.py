@@ -193,7 +193,7 @@ def test_waters_without_forces_turn_for_ever() -> None:
     run.thermalise()
     run.step(500)
     before = run.temperatures_of_solute_and_water_k()[1]
-    run.step(3000)
+    run.step(6000)
     changes = run.temperatures_of_solute_and_water_k()[1] / before - 1.0
     # Velocities lie half a step beside positions, where rotation has 5e-4 more, by 1e-5 more or less in each replica.
     assert abs(changes.mean()) < 3e-5
@@ -201,7 +201,7 @@ def test_waters_without_forces_turn_for_ever() -> None:
 
 def test_waters_stay_rigid_and_warm() -> None:
     run = started("alanine-dipeptide", timestep_ps=0.004, friction_per_ps=10.0)
-    run.step(250)
+    run.step(500)
     temperatures = []
     for _ in range(8):
         run.step(50)
@@ -227,7 +227,7 @@ def test_waters_trade_places_without_moving(monkeypatch: pytest.MonkeyPatch) -> 
         monkeypatch.setattr(force_field, "_TRADED_NM", reach)
         run = started("alanine-dipeptide", timestep_ps=0.004)
         before = run.positions_nm
-        for _ in range(20):
+        for _ in range(30):
             run.step(40)
             now = run.positions_nm
             assert np.abs(now - before).max() < 0.4  # 160 fs; a cell is 2.15 nm wide
@@ -238,17 +238,17 @@ def test_waters_trade_places_without_moving(monkeypatch: pytest.MonkeyPatch) -> 
         energies, forces = run.energies_and_forces(before)
         np.testing.assert_allclose(energies, run.energies(), atol=0.1)
         assert np.isfinite(forces).all()
-    assert found[0] < 0.9 * found[1]
+    assert found[0] < 0.8 * found[1]
 
 
 def test_it_goes_on_as_if_nothing_had_been() -> None:
     run = started("alanine-dipeptide", timestep_ps=0.004)
-    run.step(100)
+    run.step(500)
     blob = run.checkpoint()
-    run.step(100)
+    run.step(500)
     other = replicas(wet("alanine-dipeptide")[1], timestep_ps=0.004, seed=9)
     other.restore(blob)
-    other.step(100)
+    other.step(500)
     np.testing.assert_array_equal(run.positions_nm, other.positions_nm)
     np.testing.assert_array_equal(run.velocities_nm_ps, other.velocities_nm_ps)
     with pytest.raises(InputError, match="another molecule"):

@@ -133,7 +133,7 @@ def test_annealed_replicas_start_all_over(tmp_path: Path, monkeypatch: pytest.Mo
     monkeypatch.setattr(runner.ChunkSampler, "at", at_asked)
     still = rolled("still", 0.0)
     assert np.abs(still).max() < 60.0
-    turned = rolled("turned", 4.0)
+    turned = rolled("turned", 10.0)
     assert np.abs(turned).max() > 90.0
     assert asked[:3] == [600.0] * 3 and asked[-1] == pytest.approx(300.0) and (np.diff(asked[2:]) < 0.0).all()
     # One that flies apart starts as it was.
@@ -147,7 +147,7 @@ def test_annealed_replicas_start_all_over(tmp_path: Path, monkeypatch: pytest.Mo
         return drawn
 
     monkeypatch.setattr(runner.ChunkSampler, "draw", flying)
-    lost = rolled("lost", 4.0)
+    lost = rolled("lost", 10.0)
     assert abs(lost[1]) < 60.0
     assert abs(lost[0] - turned[0]) < 1e-3
     other = weights(Painet(PainetConfig(n_new=2, width=16)))
