@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 from abc import ABC, abstractmethod
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import torch
@@ -25,13 +25,14 @@ class Molecule:
 
     `elements` (n_atoms,) int64 atomic numbers, 0 for a particle of a model system; `masses_da` (n_atoms,) float32;
     `bonds` (n_bonds, 2) int64; `own`: what a model's `featurise` adds for itself, a tensor with
-    a row for each atom or anything else with a method `to(device)`.
+    a row for each atom or anything else with a method `to(device)`; `charge` of the whole molecule in e.
     """
 
     elements: Tensor
     masses_da: Tensor
     bonds: Tensor
     own: Any = None
+    charge: int = 0
 
     @staticmethod
     def of(scene: Scene, own: Any = None) -> Molecule:
@@ -42,6 +43,7 @@ class Molecule:
             masses_da=torch.tensor(scene.masses_da.tolist(), dtype=torch.float32),
             bonds=torch.tensor(scene.bonds.tolist(), dtype=torch.int64).reshape(-1, 2),
             own=own,
+            charge=int(scene.formal_charges.sum()),
         )
 
     @property
@@ -50,12 +52,14 @@ class Molecule:
 
     def to(self, device: torch.device) -> Molecule:
         own = None if self.own is None else self.own.to(device)
-        return Molecule(self.elements.to(device), self.masses_da.to(device), self.bonds.to(device), own)
+        return replace(self, elements=self.elements.to(device), masses_da=self.masses_da.to(device),
+                       bonds=self.bonds.to(device), own=own)  # fmt: skip
 
     def permuted(self, order: Tensor) -> Molecule:
         """Return the molecule whose atom k is this one's atom order[k]; `own` is permuted where it is a tensor."""
         own = self.own[order] if isinstance(self.own, Tensor) else self.own
-        return Molecule(self.elements[order], self.masses_da[order], torch.argsort(order)[self.bonds], own)
+        bonds = torch.argsort(order)[self.bonds]
+        return replace(self, elements=self.elements[order], masses_da=self.masses_da[order], bonds=bonds, own=own)
 
 
 @dataclass(frozen=True)

@@ -73,7 +73,7 @@ def train(references: Trajectories, out: PathLike, options: TrainOptions) -> Pat
 
     With `level='gfn2-xtb'` it learns one molecule, named as by `reference`, from that level's energies and forces:
     painet as a potential, which asks about the states that it is least sure of. The samples stay beside the weights
-    (NAME.samples.safetensors).
+    (NAME.samples.safetensors). With `start_from` it begins with the network of a potential, of whatever molecule.
 
     Architecture and settings that are not given are chosen to suit the references, and each choice is said with its
     reason (`explain_training` returns them all); one molecule at one spacing of frames gets lam-slide as it is.
@@ -161,12 +161,15 @@ def _asked(options: TrainOptions, out: Path) -> TrainingRequest:
     """Return the request; `arch` is empty where nothing names one. Raises InputError for an unknown one."""
     from surrogate.models.architecture import TrainingRequest
 
-    start, arch = options.start_from, options.arch
-    file = None if start is None else weights_path(start)
-    if arch is None and file is not None:
+    arch = POTENTIAL if options.level is not None and options.arch in (None, "painet") else options.arch
+    file = None if options.start_from is None else weights_path(options.start_from)
+    if file is not None:
         from surrogate.models.weights import read_header
 
-        arch = read_header(file).arch
+        found = read_header(file).arch
+        if arch not in (None, found):
+            raise InputError(f"{file} holds {found}, not {arch}.")
+        arch = found
     if arch is not None:
         architecture(arch)
     return TrainingRequest(
@@ -190,11 +193,6 @@ def _plan(
     for the architecture and one for each setting that was chosen."""
     from surrogate.data import References
 
-    if asked.arch and asked.start_from is not None:
-        from surrogate.models.weights import read_header
-
-        if (found_arch := read_header(asked.start_from).arch) != asked.arch:
-            raise InputError(f"{asked.start_from} holds {found_arch}, not {asked.arch}.")
     paths = find_trajectories(references, verify=True)
     held = [] if validation is None else find_trajectories(validation, verify=True)
     found = References(tuple(paths), tuple(held), spool=asked.out.parent)
@@ -263,10 +261,9 @@ def learn_molecule(
         raise InputError(
             f"a level is worth learning where it is expensive; use `level='{QUANTUM}'`, or a reference of MD."
         )
-    if request.arch not in ("", "painet", POTENTIAL):
+    if request.arch != POTENTIAL:
         raise InputError(f"{request.arch} learns from trajectories; use `arch='painet'`, or leave `level` out.")
-    unknown = {"`start_from`": options.start_from, "`longest_lag_ps`": options.longest_lag_ps,
-               "`validation`": options.validation}  # fmt: skip
+    unknown = {"`longest_lag_ps`": options.longest_lag_ps, "`validation`": options.validation}
     if given_too := [name for name, value in unknown.items() if value is not None]:
         raise InputError(f"{', '.join(given_too)}: a potential learns from states that it asks about; leave it out.")
     if request.budget_s is None and request.steps is None:

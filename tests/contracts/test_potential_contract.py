@@ -287,6 +287,23 @@ def test_members_agree_with_the_potential_and_differ_from_each_other() -> None:
     assert (members[0] - members[1]).abs().max() > 1.0
 
 
+@pytest.mark.parametrize("charge", [-1, 1])
+def test_a_charge_changes_energies_and_none_changes_nothing(charge: int) -> None:
+    model, neutral, x = lively(), branched_chain(9), walks(9)
+    ion = replace(neutral, charge=charge)
+    energies = {one.charge: model.energies(x, one) for one in (neutral, ion)}
+    assert not torch.allclose(energies[0], energies[charge], rtol=1e-3)
+    members, gradient = model.gradient(x, ion)(x)
+    torch.testing.assert_close(members, energies[charge], rtol=1e-4, atol=1e-2)
+    torch.testing.assert_close(-gradient, model.evaluate(x, ion).forces_kj_mol_nm, rtol=1e-3, atol=0.5)
+    with torch.no_grad():
+        model.network.embed_type.weight[0] += 1.0
+    assert torch.equal(model.energies(x, replace(neutral)), energies[0])
+    assert not torch.equal(model.energies(x, replace(ion)), energies[charge])
+    order = torch.randperm(9)
+    assert ion.permuted(order).charge == ion.to(torch.device("cpu")).charge == charge
+
+
 def test_impossible_settings_are_refused() -> None:
     for wrong in ({"ensemble": "npt"}, {"attention": "sparse"}, {"n_members": 0}, {"n_radial": 1}, {"step": 1.0}):
         with pytest.raises(InputError):

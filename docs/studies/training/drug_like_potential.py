@@ -57,7 +57,8 @@ def load(folder: Path, splits: Sequence[str], most: int | None = None) -> list[L
             energies = data["energies_kj_mol"] - data["energies_kj_mol"].min()
             numbers = torch.from_numpy(data["numbers"])
             kept = energies < HIGHEST_KJ_MOL * len(numbers)
-            molecule = Molecule(numbers, torch.ones(len(numbers)), torch.from_numpy(data["bonds"]))
+            molecule = Molecule(numbers, torch.ones(len(numbers)), torch.from_numpy(data["bonds"]),
+                                charge=int(data["charges"].sum()))  # fmt: skip
             arrays = (data["positions_nm"][kept], energies[kept].astype(np.float32), data["forces_kj_mol_nm"][kept])
         if kept.sum() >= 8:
             found.append(Labelled(Topology.of(molecule), *map(torch.from_numpy, arrays)))

@@ -340,7 +340,9 @@ class EnergyNetwork(nn.Module):
         """Return what depends on the molecule, and on frames `(rows, n_atoms, 3)` nm by who is near whom."""
         edges = find_edges(topology.shells, positions_nm, self.config.cutoff_nm)
         elements = topology.molecule.elements
-        z = self.surroundings(self.embed_type(elements), topology.bonds)
+        # Row 0, of no element, is what an elementary charge of the molecule adds to all its atoms.
+        of_element = self.embed_type(elements) + topology.molecule.charge * self.embed_type.weight[0]
+        z = self.surroundings(of_element, topology.bonds)
         of_edge = self.of_pair(torch.cat([z[edges.receiver] + self.of_shell(edges.shell), z[edges.sender]], dim=-1))
         types = edges.shell, elements[edges.receiver], elements[edges.sender]
         # An atom is as far from itself as no wall stands.
@@ -658,3 +660,9 @@ class PainetPotential(Potential):
         """Take the units of what is learned from samples: mean energy, and the root mean square force over 0.1 nm."""
         self.energy_offset_kj_mol.fill_(float(energies_kj_mol.mean()))
         self.energy_scale_kj_mol.fill_(max(0.1 * float(forces_kj_mol_nm.square().mean().sqrt()), 1e-3))
+
+    def set_offset(self, positions_nm: Tensor, energies_kj_mol: Tensor, topology: Topology) -> None:
+        """Take the zero of energies from samples `(n, n_atoms, 3)` nm, and leave the scale that was learned with."""
+        with torch.no_grad():
+            found = torch.cat([self.members(x, topology).mean(-1) for x in positions_nm.split(256)])
+        self.energy_offset_kj_mol.add_(float((energies_kj_mol - found).mean()))

@@ -17,7 +17,7 @@ from surrogate.data import References
 from surrogate.models import architecture as arch
 from surrogate.models.painet.energy import PainetPotential, PotentialConfig
 from surrogate.models.propagator import Molecule
-from surrogate.models.weights import TrainingDomain, provenance_of, save_weights
+from surrogate.models.weights import TrainingDomain, Weights, load_weights, provenance_of, read_header, save_weights
 from surrogate.training import loop
 from surrogate.training.devices import StepThreads, torch_threads
 from systems.chemistry.graph import turn_torsions
@@ -177,8 +177,9 @@ class Learner:
     measures on held-out states."""
 
     def __init__(
-        self, model: PainetPotential, reference: ReferenceForces, config: PotentialTraining, out: Path, *, resume: bool
-    ) -> None:
+        self, model: PainetPotential, reference: ReferenceForces, config: PotentialTraining, out: Path, *,
+        resume: bool, pretrained: bool = False,
+    ) -> None:  # fmt: skip
         self.model, self.reference, self.config = model, reference, config
         self.molecule = Molecule.of(reference.scene)
         self.topology = model.topology(self.molecule)
@@ -206,8 +207,11 @@ class Learner:
             )
             self._labelling_s, self._labelled = time.monotonic() - began, config.first
         # Samples may be all that an interrupted training left; a state that it left brings its own.
-        _, energies, forces = self.samples.tensors()
-        model.set_scales(energies, forces)
+        x, energies, forces = self.samples.tensors()
+        if pretrained:
+            model.set_offset(x, energies, self.topology)
+        else:
+            model.set_scales(energies, forces)
 
     @property
     def share(self) -> float:
@@ -361,13 +365,17 @@ def samples_path(out: Path) -> Path:
 
 def learn_potential(
     reference: ReferenceForces, out: Path, model_config: PotentialConfig, config: PotentialTraining, *,
-    resume: bool = False, progress: loop.ProgressFn | None = None, before_s: float = 0.0, after_s: float = 0.0,
+    start: Weights | None = None, resume: bool = False, progress: loop.ProgressFn | None = None, before_s: float = 0.0,
+    after_s: float = 0.0,
 ) -> Path:  # fmt: skip
     """Learn a molecule's energies and forces and write weights `out`; beside them stay the samples and the curves
-    (.csv). Of the budget `before_s` are spent already, and `after_s` are wanted by the caller, for later."""
+    (.csv). The network begins as that of `start`, whose configuration is then `model_config`. Of the budget `before_s`
+    are spent already, and `after_s` are wanted by the caller, for later."""
     began = time.monotonic() - before_s
     torch.manual_seed(config.seed)
     model = PainetPotential(model_config)
+    if start is not None:
+        model.load_state_dict(start.model.state_dict())
     if not resume:
         samples_path(out).unlink(missing_ok=True)
     # Frames change least in the own bath, with bonds as rigid as rollouts have them, and most when hot.
@@ -376,7 +384,7 @@ def learn_potential(
         for kelvin, rigid in ((model_config.temperature_k, model_config.constrain_hydrogens),
                               (max(config.temperatures_k), False))
     ]  # fmt: skip
-    learner = Learner(model, reference, config, out, resume=resume)
+    learner = Learner(model, reference, config, out, resume=resume, pretrained=start is not None)
     budget_s = config.budget_s
     if budget_s is not None:
         left_s = budget_s - (time.monotonic() - began) - after_s
@@ -397,7 +405,7 @@ def learn_potential(
         origin = {"reference_ns": 0.0, "sources": [{"file": learner.path.name, "n_frames": len(learner.samples)}]}
         found = {k.removeprefix("validation_"): float(f"{v:.6g}") for k, v in learner.errors().items()}
         settings = {"seed": config.seed, "training_s": round(sum(spent_s), 1), **found}
-        save_weights(out, model.eval(), domain, provenance_of(origin, settings))
+        save_weights(out, model.eval(), domain, provenance_of(origin, settings, start))
 
     learner.begin(budget_s)
     stages = [loop.Stage(model, stage, learner.loss, learner.errors, saves=False)]
@@ -416,8 +424,10 @@ class PotentialTrainer(arch.Trainer):
         )
 
     def settings(self, request: arch.TrainingRequest) -> arch.Settings:
-        training = request.settings(PotentialTraining)
-        return arch.Settings(PotentialConfig.from_dict(request.model), training, arch.RESOLVED)
+        if request.start_from is not None and request.model:
+            raise InputError("`start_from` takes the configuration of its weights; leave [model] of `config` out.")
+        model = request.model if request.start_from is None else read_header(request.start_from).config
+        return arch.Settings(PotentialConfig.from_dict(model), request.settings(PotentialTraining), arch.RESOLVED)
 
     def prepare(self, references: References, request: arch.TrainingRequest) -> arch.Prepared:
         self.check(request)
@@ -426,8 +436,9 @@ class PotentialTrainer(arch.Trainer):
               before_s: float = 0.0, after_s: float = 0.0) -> Path:  # fmt: skip
         """Learn a molecule from its reference, as the request has it, and return the weights; see `learn_potential`."""
         settings = self.settings(request)
+        start = None if request.start_from is None else load_weights(request.start_from)
         return learn_potential(
-            reference, request.out, settings.model, settings.training, resume=request.resume,
+            reference, request.out, settings.model, settings.training, start=start, resume=request.resume,
             progress=lambda stage, share, metrics: advance(stage, share), before_s=before_s, after_s=after_s,
         )  # fmt: skip
 

@@ -45,9 +45,9 @@ class Answers:
 class Springs:
     """A cheap reference: springs between all atoms at most two bonds apart."""
 
-    def __init__(self, *, silent: bool = False) -> None:
+    def __init__(self, *, silent: bool = False, zero_kj_mol: float = -7000.0) -> None:
         self.scene: Scene = scene_from_smiles("O")
-        self.silent, self.asked = silent, 0
+        self.silent, self.asked, self.zero_kj_mol = silent, 0, zero_kj_mol
         x = self.scene.positions_nm
         pairs = [(i, j) for i in range(3) for j in range(i + 1, 3)]
         self.pairs = [(i, j, float(np.linalg.norm(x[i] - x[j]))) for i, j in pairs]
@@ -62,7 +62,7 @@ class Springs:
     def label(self, positions_nm: Any) -> Answers:
         self.asked += len(positions_nm)
         x = positions_nm[:0] if self.silent else np.asarray(positions_nm, dtype=np.float64)
-        energies, forces = np.full(len(x), -7000.0), np.zeros_like(x)
+        energies, forces = np.full(len(x), self.zero_kj_mol), np.zeros_like(x)
         for i, j, rest in self.pairs:
             apart = x[:, i] - x[:, j]
             length = np.linalg.norm(apart, axis=-1)
@@ -94,6 +94,26 @@ def test_it_learns_forces_and_asks_about_more_states(tmp_path: Path) -> None:
     chunk = model.next_chunk(torch.tensor(reference.scene.positions_nm[None, None]).float(), molecule, noise)
     lengths = (chunk.frames_nm[..., 0, :] - chunk.frames_nm[..., 1, :]).norm(dim=-1)
     assert ((lengths - reference.pairs[0][2]).abs() < 0.05).all()
+
+
+def test_it_begins_with_what_other_weights_know(tmp_path: Path) -> None:
+    known = tmp_path / "known.safetensors"
+    learn_potential(Springs(), known, SMALL, replace(QUICK, steps=100, learning_rate=5e-3, matrix_rate=0.05))
+    few = replace(QUICK, steps=2, learning_rate=1e-5, matrix_rate=1e-5)
+    found = {}
+    for name, start in (("fresh", None), ("pretrained", load_weights(known))):
+        out = tmp_path / f"{name}.safetensors"
+        learn_potential(Springs(zero_kj_mol=900.0), out, SMALL, few, start=start)
+        found[name] = load_weights(out)
+    fresh, pretrained = (found[name].provenance for name in ("fresh", "pretrained"))
+    assert pretrained["force_rms"] < 0.4 * fresh["force_rms"]
+    assert pretrained["from"]["hash"] == load_weights(known).hash and "from" not in fresh
+    # Zeros of energy are those of the molecule that is learned.
+    x, energies, _ = Samples.load(
+        samples_path(tmp_path / "pretrained.safetensors"), Springs().scene.topology_hash
+    ).tensors()
+    told = found["pretrained"].model.evaluate(x, Molecule.of(Springs().scene)).energy_kj_mol
+    assert float((told - energies).mean().abs()) < 0.1 * float(energies.std()) < 100.0
 
 
 def test_a_budget_is_for_all_that_a_training_takes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -291,7 +291,9 @@ def refusal(tmp_path: Path, scene: str | list[str] = "smiles:O", **options: obje
 def test_what_means_nothing_for_a_potential_is_refused(tmp_path: Path) -> None:
     assert "reference of MD" in refusal(tmp_path, level="mm")
     assert "learns from trajectories" in refusal(tmp_path, arch="lam-slide")
-    assert "`start_from`" in refusal(tmp_path, start_from="paracetamol-gfn2-xtb", arch="painet")
+    started = {"start_from": "paracetamol-gfn2-xtb"}
+    assert "holds painet-potential, not lam-slide" in refusal(tmp_path, **started, arch="lam-slide")
+    assert "`start_from` takes the configuration" in refusal(tmp_path, **started, model={"width": 8})
     assert "`longest_lag_ps`" in refusal(tmp_path, longest_lag_ps=1.0)
     assert "budget_s" in refusal(tmp_path, steps=None)
     assert "one molecule" in refusal(tmp_path, scene=["smiles:O", "smiles:CO"])
