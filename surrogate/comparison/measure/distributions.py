@@ -104,12 +104,20 @@ def divergence(counts_p: FloatArray, counts_q: FloatArray) -> FloatArray:
     """
     n_p, n_q = counts_p.sum(-1, keepdims=True), counts_q.sum(-1, keepdims=True)
     p, q = counts_p / np.maximum(n_p, 1e-300), counts_q / np.maximum(n_q, 1e-300)
-    m = 0.5 * (p + q)
-    # Adding the least positive number leaves every positive one as it is, and makes 0 log 0 zero.
-    tiny = np.finfo(np.float64).tiny
-    out = (0.5 * (p * np.log(p + tiny) + q * np.log(q + tiny)) - m * np.log(m + tiny)).sum(-1)
+    out = _minus_entropy(p) + _minus_entropy(q)
+    p += q
+    p *= 0.5
+    out = 0.5 * out - _minus_entropy(p)
     empty = (n_p[..., 0] <= 0) | (n_q[..., 0] <= 0)
     return np.where(empty, np.nan, np.clip(out, 0.0, math.log(2.0)))
+
+
+def _minus_entropy(p: FloatArray) -> FloatArray:
+    """Return the sum of p log p along the last axis."""
+    # Adding the least positive number leaves every positive one as it is, and makes 0 log 0 zero.
+    log = p + np.finfo(np.float64).tiny
+    np.log(log, out=log)
+    return np.asarray(np.einsum("...i,...i->...", p, log))
 
 
 def distance(counts_p: FloatArray, counts_q: FloatArray) -> FloatArray:

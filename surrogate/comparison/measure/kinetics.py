@@ -45,22 +45,30 @@ def lag_sums(segments: Sequence[AnyFloat], blocks: Blocks, n_lags: int) -> LagSu
     A pair belongs to the block in which it starts and may end in the next one, but never in another segment, so that
     the sum over blocks is exactly the sum over all pairs.
     """
+    from scipy.fft import next_fast_len
+
     out = [np.zeros((blocks.n_blocks, n_lags)) for _ in range(4)]
     for piece in blocks.pieces:
         series = np.asarray(segments[piece.segment], dtype=np.float64)
         tail = series[piece.start : min(piece.stop + n_lags - 1, len(series))]
         n_head = piece.stop - piece.start
-        size = 1 << (len(tail) + n_head - 1).bit_length()
+        size = next_fast_len(len(tail) + n_head - 1, real=True)
+        keep = min(n_lags, len(tail))
         finite = np.isfinite(tail)
         values = np.where(finite, tail, 0.0)
-        present = finite.astype(np.float64)
-        tail_x, tail_1 = np.fft.rfft(values, size), np.fft.rfft(present, size)
-        head_x = np.conj(np.fft.rfft(values[:n_head], size))
-        head_1 = np.conj(np.fft.rfft(present[:n_head], size))
-        keep = min(n_lags, len(tail))
-        products = (head_x * tail_x, head_x * tail_1, head_1 * tail_x, head_1 * tail_1)
-        for total, product in zip(out, products, strict=True):
-            total[piece.block, :keep] += np.fft.irfft(product, size)[:keep]
+        tail_x, head_x = np.fft.rfft(values, size), np.conj(np.fft.rfft(values[:n_head], size))
+        out[0][piece.block, :keep] += np.fft.irfft(head_x * tail_x, size)[:keep]
+        if finite.all():  # what is left are sums over the first and the last of the values
+            begin = np.arange(keep)
+            n = np.minimum(n_head, len(tail) - begin)
+            upto = np.concatenate([[0.0], values.cumsum()])
+            sums = [upto[n], upto[begin + n] - upto[begin], n]
+        else:
+            tail_1, head_1 = np.fft.rfft(finite, size), np.conj(np.fft.rfft(finite[:n_head], size))
+            products = (head_x * tail_1, head_1 * tail_x, head_1 * tail_1)
+            sums = [np.fft.irfft(product, size)[:keep] for product in products]
+        for total, found in zip(out[1:], sums, strict=True):
+            total[piece.block, :keep] += found
     return LagSums(out[0], out[1], out[2], np.rint(out[3]))
 
 

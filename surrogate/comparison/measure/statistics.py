@@ -240,8 +240,12 @@ def permutation_p(
         size = min(batch, n_permutations - done)
         side = np.zeros((size, n))
         for members in groups:
-            order = members[rng.random((size, len(members))).argsort(axis=1)]
-            np.put_along_axis(side, order[:, : int((members < n_a).sum())], 1.0, axis=1)
+            n_left = int((members < n_a).sum())
+            if 0 < n_left < len(members):
+                dealt = np.argpartition(rng.random((size, len(members))), n_left, axis=1)[:, :n_left]
+                np.put_along_axis(side, members[dealt], 1.0, axis=1)
+            else:
+                side[:, members] = float(n_left > 0)
         left = side @ pooled
         as_far = n_as_far + (distance(left, total - left) >= observed * (1 - 1e-12)).cumsum()
         if as_far[-1] >= ENOUGH_AS_FAR:
