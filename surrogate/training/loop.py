@@ -293,6 +293,7 @@ def run_stage(stage: Stage, place: StagePlace, *, progress: ProgressFn | None = 
     devices.keep_freed_memory()
     module, config, device = stage.module, stage.config, place.device
     bf16 = config.bf16 and devices.bf16_pays(device.type)
+    parameters = [p for p in module.parameters() if p.requires_grad]
     optimisers = optimisers_of(module, config)
     rates = [[group["lr"] for group in optimiser.param_groups] for optimiser in optimisers]
     ema = Ema(module, config.ema_decay)
@@ -313,7 +314,8 @@ def run_stage(stage: Stage, place: StagePlace, *, progress: ProgressFn | None = 
         with torch.autocast(device.type, dtype=torch.bfloat16, enabled=bf16):
             loss, terms = stage.loss(generator)
         module.zero_grad(set_to_none=True)
-        loss.backward()
+        # Not to the positions of which forces are the gradient.
+        loss.backward(inputs=parameters)
         now = time.monotonic()
         spent_s, last = spent_s + now - last, now
         norm = nn.utils.clip_grad_norm_(module.parameters(), config.clip_norm)

@@ -192,7 +192,7 @@ def main() -> None:
     training.add_argument("--budget", type=lambda text: parse_wall_s(text, "--budget"), required=True)
     training.add_argument("--resume", action="store_true")
     training.add_argument("--molecules", type=int, default=4)
-    training.add_argument("--rows", type=int, default=8)
+    training.add_argument("--rows", type=int, default=24)
     training.add_argument("--most", type=int, help="molecules to train on")
     training.add_argument("--threads", type=int, default=1)
     training.add_argument("--validate", type=float, default=300.0)
