@@ -99,7 +99,6 @@ class TrajectoryWriter(FrameStore, ABC):
         """Return the HDF5 file that holds the columns of a trajectory."""
         return path
 
-    @abstractmethod
     def _lay_out(self, file: h5py.File, scene: Scene, columns: Sequence[str]) -> None:
         """Add the format's own groups and columns, and `columns` of velocities and forces, to a new store."""
 

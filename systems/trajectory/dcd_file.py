@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import os
 import warnings
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -23,19 +22,10 @@ import numpy.typing as npt
 
 from systems.chemistry.distance_bonds import lengths_and_angles, read_cells
 from systems.errors import TrajectoryError
-from systems.files.whole_file import write_whole
+from systems.files.whole_file import create_whole, write_whole
 from systems.scene import Scene
 from systems.trajectory.companion_writer import is_our_topology, meta_path, topology_path
-from systems.trajectory.store import (
-    CELLS,
-    ENDS,
-    FRAMES,
-    Columns,
-    Float32Array,
-    Float64Array,
-    FrameBlock,
-    add_column,
-)
+from systems.trajectory.store import CELLS, ENDS, FRAMES, Columns, Float32Array, Float64Array, FrameBlock
 from systems.trajectory.xtc_file import CompanionReader, CompanionWriter, check_size, is_of_xtc
 
 AKMA_PS = 4.888821e-2  # the value MDAnalysis and OpenMM use for CHARMM's unit of time
@@ -207,11 +197,9 @@ class DcdWriter(CompanionWriter):
 
     _layout: DcdLayout
 
-    def _lay_out(self, file: h5py.File, scene: Scene, columns: Sequence[str]) -> None:
-        add_column(file, "time", 0, "<f8")
-
-    def _head(self, scene: Scene) -> bytes:
-        return header_bytes(0, 0, 1, 0.0, has_cell=scene.cell_nm is not None) + title_bytes(scene.n_atoms)
+    def _begin(self, path: Path, scene: Scene) -> None:
+        head = header_bytes(0, 0, 1, 0.0, has_cell=scene.cell_nm is not None)
+        create_whole(path, head + title_bytes(scene.n_atoms))
 
     def _adopt(self) -> None:
         self._layout = layout = DcdLayout(self.path)

@@ -234,6 +234,7 @@ def create_store(
         group.create_group("scalars")
         set_text(group, "record", sealed(json_text(record, "record")), _RECORD_BYTES)
         set_text(group, "scene", sealed(json_text(scene.to_dict(), "scene")))
+        add_column(file, "time", 0, "<f8")
         add_column(file, "surromd/chunk_idx", 0, "<i4")
         for name in (FRAMES, *columns, *([] if scene.cell_nm is None else [CELLS])):
             add_column(file, f"{CHECKSUMS}/{name}", 0, "<u4")
