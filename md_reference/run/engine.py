@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -20,6 +20,7 @@ from md_reference.run.machine import make_context, platform_for
 from systems.chemistry.element_data import covalent_radius_nm
 from systems.chemistry.validity import changed_stereo
 from systems.errors import PreparationError, SimulationError, first_line, listed
+from systems.files.whole_file import Closing
 from systems.scene import FloatArray, Scene, part_of
 from systems.units import GAS_CONSTANT_KJ_MOL_K, hottest_k
 
@@ -86,7 +87,7 @@ def refuse_damaged(scene: Scene, minimised_nm: FloatArray) -> None:
         )
 
 
-class Engine:
+class Engine(Closing):
     """One scene, one force field, one integrator, one Context. Use as a context manager or call `close`.
 
     `conditions`: force field and ensemble resolved for the scene (`config.resolved`). `threads`: of the CPU platform.
@@ -126,12 +127,6 @@ class Engine:
         self.set_positions(scene.positions_nm)
         # Degrees of freedom that hold kinetic energy; without a bath those of the centre of mass are at rest.
         self.n_dof = 3 * int(np.count_nonzero(self._masses_da)) - self.n_constraints - 3 * self._keeps_momentum
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
 
     @property
     def n_constraints(self) -> int:

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import weakref
 from collections.abc import Sequence
-from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -235,5 +234,5 @@ def write_weights(path: Path, weights: Float64Array) -> None:
     """Write weights `(n_frames,)` into a trajectory of ours, or replace them. Raises InputError for another number of
     them, TrajectoryError for a file of others, StorageError."""
     store = meta_path(path) if path.suffix.lower() in POSITIONS_ALONE else path
-    with closing(FrameStore(store)) as file:
+    with FrameStore(store) as file:
         file.write_weights(np.asarray(weights, dtype=np.float64))

@@ -28,6 +28,7 @@ from systems.files.outside import UNREADABLE, open_checked
 from systems.files.schema import fitted, parsed
 from systems.files.whole_file import (
     AtomicFile,
+    Closing,
     checksum_rows,
     create_whole,
     frame_checksums,
@@ -322,7 +323,7 @@ def read_run_id(file: h5py.File) -> str:
     return file["surromd/run_id"][()].decode("ascii") if "surromd/run_id" in file else ""
 
 
-class FrameStore:
+class FrameStore(Closing):
     """Appends to a file made by `create_store`, one transaction per append. Raises TrajectoryError when the file is
     damaged or not ours (this version's), StorageError."""
 
