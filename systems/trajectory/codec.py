@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from systems.chemistry.distance_bonds import lengths_and_angles
 from systems.errors import InputError, TrajectoryError
 from systems.files.whole_file import OutputLock, journal_path
 from systems.scene import Scene
@@ -144,8 +145,6 @@ def to_mdtraj(
     for a damaged one."""
     import mdtraj
 
-    from systems.chemistry.distance_bonds import lengths_and_angles
-
     scene, positions, times, cells = _read(source, start, stop, stride)
     lengths, angles = (None, None) if cells is None else lengths_and_angles(cells)
     return mdtraj.Trajectory(
@@ -161,8 +160,6 @@ def to_mdanalysis(
     step: frames that are unevenly spaced are refused. Raises InputError, TrajectoryError."""
     import MDAnalysis
     from MDAnalysis.coordinates.memory import MemoryReader
-
-    from systems.chemistry.distance_bonds import lengths_and_angles
 
     scene, positions, times, cells = _read(source, start, stop, stride)
     gaps = np.diff(times)
