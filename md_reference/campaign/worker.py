@@ -76,14 +76,13 @@ def scene_path(folder: Path, name: str) -> Path:
 
 def prepare_scene(folder: Path, spec: SceneSpec, config: MDConfig, seed: int, replicas: int = 1) -> dict[str, Any]:
     """Prepare a scene, or take the one that lies in `scenes/NAME.json`, and return its summary. `config`: of any of its
-    runs, which share all but temperature and seed; `seed`: of the water around it; `replicas`: how many begin apart."""
+    runs, which share all but temperature and seed; `seed`: of the water around it; `replicas`: how many begin apart.
+
+    A new one is solvated where the solvent is made of molecules, starts of its replicas are drawn; its forces are
+    built, so that replicas find parameters that take long in the cache."""
     path = scene_path(folder, spec.name)
-    return (load_prepared(path) if path.is_file() else _prepare(path, spec, config, seed, replicas)).summary()
-
-
-def _prepare(path: Path, spec: SceneSpec, config: MDConfig, seed: int, replicas: int) -> PreparedScene:
-    """Write and return the scene, solvated where the solvent is made of molecules, starts of its replicas drawn; its
-    forces are built, so that replicas find parameters that take long in the cache."""
+    if path.is_file():
+        return load_prepared(path).summary()
     scene = prepare(spec.source, options=_chosen(Preparation, spec))
     force = resolve(scene, config.force)
     if spec.preparation.get("keep_water"):
@@ -95,16 +94,9 @@ def _prepare(path: Path, spec: SceneSpec, config: MDConfig, seed: int, replicas:
     if replicas > 1 and config.starts == "many":
         starts, how = many_starts(prepared.scene, replace(config, force=force, seed=seed), replicas)
         prepared = replace(prepared, starts_nm=tuple(s.positions_nm.tolist() for s in starts), started=how)
-    record = {
-        "scene": prepared.scene.to_dict(),
-        "force": asdict(force),
-        "starts_nm": prepared.starts_nm,
-        "started": prepared.started,
-        "seed": seed,
-    }
     path.parent.mkdir(parents=True, exist_ok=True)
-    create_whole(path, json.dumps(record))
-    return prepared
+    create_whole(path, json.dumps(vars(prepared) | {"scene": prepared.scene.to_dict(), "force": asdict(force)}))
+    return prepared.summary()
 
 
 def _chosen(kind: type[T], spec: SceneSpec) -> T:

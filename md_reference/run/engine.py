@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -20,6 +20,7 @@ from md_reference.run.machine import make_context, platform_for
 from systems.chemistry.element_data import covalent_radius_nm
 from systems.chemistry.validity import changed_stereo
 from systems.errors import PreparationError, SimulationError, first_line, listed
+from systems.files.whole_file import Closing
 from systems.scene import FloatArray, Scene, part_of
 from systems.units import GAS_CONSTANT_KJ_MOL_K, hottest_k
 
@@ -31,7 +32,6 @@ _BROKEN = 1.25
 # 0.001 nm of its rest, where an atom pulled by kT strays 0.03 nm.
 _SPRING_KJ_MOL_NM2 = 2500.0
 _CONSTRAINT_TOLERANCE = 1e-5
-_SPRINGS_GROUP = 31
 
 
 @dataclass(frozen=True)
@@ -86,7 +86,7 @@ def refuse_damaged(scene: Scene, minimised_nm: FloatArray) -> None:
         )
 
 
-class Engine:
+class Engine(Closing):
     """One scene, one force field, one integrator, one Context. Use as a context manager or call `close`.
 
     `conditions`: force field and ensemble resolved for the scene (`config.resolved`). `threads`: of the CPU platform.
@@ -126,12 +126,6 @@ class Engine:
         self.set_positions(scene.positions_nm)
         # Degrees of freedom that hold kinetic energy; without a bath those of the centre of mass are at rest.
         self.n_dof = 3 * int(np.count_nonzero(self._masses_da)) - self.n_constraints - 3 * self._keeps_momentum
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
 
     @property
     def n_constraints(self) -> int:
@@ -289,14 +283,6 @@ def _velocity_verlet(timestep_ps: float, *, constrained: bool) -> Any:
 # ---- frames whose stiff bonds are off -------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True, eq=False)
-class Relaxed:
-    """Positions `(n_atoms, 3)` nm after relaxation and their potential energy in kJ/mol, without the springs."""
-
-    positions_nm: FloatArray
-    potential_kj_mol: float
-
-
 class Relaxer(Engine):
     """An engine with a spring on each atom. `system`: as `build_system` returns it; it is copied."""
 
@@ -310,15 +296,14 @@ class Relaxer(Engine):
             self._springs.addPerParticleParameter(name)
         for k in range(scene.n_atoms):
             self._springs.addParticle(k, [0.0, 0.0, 0.0])
-        self._springs.setForceGroup(_SPRINGS_GROUP)
         held.addForce(self._springs)
         # Of the forces only whether they have a Born term matters here, for the choice of a platform.
         spec = ForceFieldSpec("auto", "auto" if born else "vacuum")
         super().__init__(scene, Conditions(force=spec, platform=platform), system=held)
 
-    def relax(self, positions_nm: npt.ArrayLike) -> Relaxed:
-        """Restore constrained bonds exactly, then minimise under the springs. Raises SimulationError where the energy
-        is not finite before or after."""
+    def relax(self, positions_nm: npt.ArrayLike) -> FloatArray:
+        """Restore constrained bonds exactly, then minimise under the springs; return the positions `(n_atoms, 3)` nm.
+        Raises SimulationError where the energy is not finite before or after."""
         start = np.asarray(positions_nm, dtype=np.float64)
         if not np.isfinite(start).all():
             raise SimulationError("a frame that is not finite cannot be relaxed")
@@ -330,5 +315,4 @@ class Relaxer(Engine):
                 raise SimulationError("the energy of a frame to relax is not finite; atoms lie on top of each other")
             self._context.applyConstraints(_CONSTRAINT_TOLERANCE)
             self.minimise()
-        without_springs = self._query(energy=True, groups=~(1 << _SPRINGS_GROUP) & 0xFFFFFFFF)
-        return Relaxed(self.positions(), float(without_springs.getPotentialEnergy()._value))
+        return self.positions()

@@ -23,6 +23,7 @@ from systems.chemistry.distance_bonds import changed_bond
 from systems.chemistry.graph import turn_torsions
 from systems.chemistry.validity import changed_stereo
 from systems.errors import PreparationError, SimulationError
+from systems.files.whole_file import Closing
 from systems.interrupts import end_with_parent
 from systems.scene import FloatArray, Scene
 
@@ -62,7 +63,7 @@ class Labels:
     rearranged: int = 0
 
 
-class Labeller:
+class Labeller(Closing):
     """GFN2-xTB of one molecule. Use as a context manager or call `close`. `n_rearranged` counts the states that were
     left out since they are another molecule. Raises PreparationError for what GFN2-xTB refuses, and for a molecule
     whose minimum is another one."""
@@ -77,12 +78,6 @@ class Labeller:
         if n_workers > 1:
             context = multiprocessing.get_context("spawn")
             self._pool = context.Pool(n_workers, _start, (scene.to_dict(),))
-
-    def __enter__(self) -> Labeller:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
 
     def close(self) -> None:
         """End the processes."""

@@ -85,7 +85,7 @@ def frames_as_starts(
         for tried, frame in enumerate(frames_nm, 1):  # noqa: B007
             stop_if_asked()
             try:
-                relaxed = relaxer.relax(np.asarray(frame, dtype=np.float64)).positions_nm
+                relaxed = relaxer.relax(np.asarray(frame, dtype=np.float64))
             except SimulationError:
                 continue
             if not check_frames(relaxed, geometry)[0] & _KEPT:

@@ -492,10 +492,9 @@ class Interventions:
                 return False
             try:
                 with timed(self.state.seconds, "relax"):
-                    relaxed = self.coupling.relax(self.chunk.frames_nm[row, frame])
+                    self.chunk.frames_nm[row, frame] = self.coupling.relax(self.chunk.frames_nm[row, frame])
             except SimulationError:
                 return False
-            self.chunk.frames_nm[row, frame] = relaxed.positions_nm
             self.chunk.marks[row, frame] = REPAIRED
             self.chunk.energies_kj_mol[row, frame] = np.nan
             self._check(np.array([row]))

@@ -18,7 +18,6 @@ from systems.errors import InputError, SurromdError
 from systems.units import whole_steps
 
 if TYPE_CHECKING:
-    from md_reference.run.engine import Relaxed
     from surrogate.models.weights import Weights
 
 
@@ -63,7 +62,7 @@ class Coupling:
         )
         self._fit = fitted_atoms(self._scene)
 
-    def relax(self, frame_nm: FloatArray) -> Relaxed:
+    def relax(self, frame_nm: FloatArray) -> FloatArray:
         """Return a frame `(n_atoms, 3)` nm with its stiff bonds at rest and all else held near where it was.
 
         Raises SimulationError for frames that are beyond repair.
@@ -88,7 +87,7 @@ class Coupling:
         start = np.asarray(start_nm, dtype=np.float64)
         frames = np.empty((n_frames, *start.shape))
         with self._engine(seed=seed) as engine:
-            engine.set_positions(self.relax(start).positions_nm)
+            engine.set_positions(self.relax(start))
             engine.thermalise()
             for k in range(n_frames):
                 engine.step(self._steps_per_frame)

@@ -76,18 +76,14 @@ def extend(
 
 
 def superposition(
-    positions_nm: npt.ArrayLike,
-    template_nm: npt.ArrayLike,
-    *,
-    idx: npt.ArrayLike | None = None,
-    weights: npt.ArrayLike | None = None,
+    positions_nm: npt.ArrayLike, template_nm: npt.ArrayLike, *, idx: npt.ArrayLike | None = None
 ) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
     """Return the rotations `(n, 3, 3)` and translations `(n, 3)` nm that lay each frame over the template.
 
     A frame x moves to `x @ R.T + t`. `positions_nm (n, n_atoms, 3)`, `template_nm (n_atoms, 3)`; `idx` selects the
-    atoms that are fitted, `weights` weighs those. Rotations are proper: a mirror image stays one. Where the best
-    rotation is not unique one of the best is returned. Source: quaternions of Horn, J. Opt. Soc. Am. A 4, 629 (1987).
-    Raises InputError for shapes that do not fit or weights that are negative or all zero.
+    atoms that are fitted. Rotations are proper: a mirror image stays one. Where the best rotation is not unique one of
+    the best is returned. Source: quaternions of Horn, J. Opt. Soc. Am. A 4, 629 (1987). Raises InputError for shapes
+    that do not fit.
     """
     x, _ = _frames(positions_nm)
     y = np.asarray(template_nm, dtype=np.float64)
@@ -96,17 +92,14 @@ def superposition(
     if idx is not None:
         chosen = np.asarray(idx, dtype=np.int64)
         x, y = x[:, chosen], y[chosen]
-    if y.shape[0] == 0:
+    if len(y) == 0:
         raise InputError("Superposition: no atom to fit.")
-    w = np.ones(len(y)) if weights is None else np.asarray(weights, dtype=np.float64)
-    if w.shape != (len(y),) or (w < 0).any() or not w.sum() > 0:
-        raise InputError(f"Superposition: weights of shape {w.shape} for {len(y)} fitted atoms, or not positive.")
-    w = w / w.sum()
+    w = np.full(len(y), 1.0 / len(y))
     centre_x = np.tensordot(x.astype(np.float64, copy=False), w, axes=(1, 0))
     centre_y = w @ y
     target = (y - centre_y) * w[:, None]
     covariance = np.tensordot(x.astype(np.float64, copy=False), target, axes=(1, 0))
-    # Weighted and centred target: sum_a w_a (y_a - c) = 0, so frames need no centring here except for rounding.
+    # The target is centred: sum_a w_a (y_a - c) = 0, so frames need no centring here except for rounding.
     covariance -= centre_x[:, :, None] * target.sum(axis=0)[None, None, :]
     rotation = _best_rotations(covariance)
     translation = centre_y - np.einsum("nij,nj->ni", rotation, centre_x)
@@ -114,16 +107,12 @@ def superposition(
 
 
 def superpose(
-    positions_nm: npt.ArrayLike,
-    template_nm: npt.ArrayLike,
-    *,
-    idx: npt.ArrayLike | None = None,
-    weights: npt.ArrayLike | None = None,
+    positions_nm: npt.ArrayLike, template_nm: npt.ArrayLike, *, idx: npt.ArrayLike | None = None
 ) -> FloatArray:
-    """Return the frames laid over the template, same shape and dtype as given; `idx` and `weights` say which atoms are
-    fitted (`superposition`). One frame `(n_atoms, 3)` gives one frame."""
+    """Return the frames laid over the template, same shape and dtype as given; `idx` says which atoms are fitted
+    (`superposition`). One frame `(n_atoms, 3)` gives one frame."""
     x, single = _frames(positions_nm)
-    rotation, translation = superposition(x, template_nm, idx=idx, weights=weights)
+    rotation, translation = superposition(x, template_nm, idx=idx)
     moved = np.matmul(x, rotation.transpose(0, 2, 1).astype(x.dtype))
     moved += translation.astype(x.dtype)[:, None, :]
     out: FloatArray = moved[0] if single else moved

@@ -17,11 +17,12 @@ import re
 import tempfile
 import time
 import zlib
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 import numpy.typing as npt
@@ -94,6 +95,20 @@ def create_whole(path: Path, content: bytes | str | Callable[[Path], object]) ->
             temporary.unlink(missing_ok=True)
 
 
+class Closing(ABC):
+    """What a `with` block closes at its end."""
+
+    @abstractmethod
+    def close(self) -> None:
+        """Close it; twice does no harm."""
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+
 # ---- one writer at a time -------------------------------------------------------------------------------------------
 
 
@@ -110,7 +125,7 @@ def replica_paths(out: Path, n_replicas: int) -> list[Path]:
     return [out.with_name(f"{out.stem}_r{k}{out.suffix}") for k in range(n_replicas)]
 
 
-class OutputLock:
+class OutputLock(Closing):
     """A lock on `.NAME.lock` beside an output, which the system gives back when this process ends, however it ends. It
     holds against other threads of this process, too. Raises TrajectoryError when another one has the output, and has
     not let go of it after `patience_s`; KeyboardInterrupt when `stopped()` while waiting; StorageError."""
@@ -160,12 +175,6 @@ class OutputLock:
                 self._lock.unlink(missing_ok=True)
             os.close(self._fd)
             self._fd = -1
-
-    def __enter__(self) -> OutputLock:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
 
 
 # ---- checksums ------------------------------------------------------------------------------------------------------

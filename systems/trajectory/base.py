@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import hashlib
-from abc import ABC, abstractmethod
+from abc import abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, Self
+from typing import Any
 
 import h5py
 import numpy as np
@@ -17,6 +17,7 @@ import numpy.typing as npt
 from systems.errors import InputError, SurromdError, TrajectoryError
 from systems.files.whole_file import (
     Checksums,
+    Closing,
     OutputLock,
     checksum_rows,
     create_whole,
@@ -45,7 +46,7 @@ from systems.trajectory.store import (
 _VERIFIED_AT_ONCE = 4096
 
 
-class TrajectoryWriter(FrameStore, ABC):
+class TrajectoryWriter(FrameStore):
     """Appends frames to one file. Each `append` is whole on disk, or not there at all, when it returns or raises."""
 
     lock: OutputLock | None = None
@@ -99,7 +100,6 @@ class TrajectoryWriter(FrameStore, ABC):
         """Return the HDF5 file that holds the columns of a trajectory."""
         return path
 
-    @abstractmethod
     def _lay_out(self, file: h5py.File, scene: Scene, columns: Sequence[str]) -> None:
         """Add the format's own groups and columns, and `columns` of velocities and forces, to a new store."""
 
@@ -207,14 +207,8 @@ class TrajectoryWriter(FrameStore, ABC):
         if self.lock is not None:
             self.lock.close()
 
-    def __enter__(self) -> Self:
-        return self
 
-    def __exit__(self, *_: object) -> None:
-        self.close()
-
-
-class TrajectoryReader(ABC):
+class TrajectoryReader(Closing):
     """Reads one file. `flags`, `chunk_idx` and `weights` are None, `record` is empty, where the file does not say.
 
     `times_known` is False where the file holds no times: `time_ps` then only counts frames. `run_id`: of the run that
@@ -361,12 +355,6 @@ class TrajectoryReader(ABC):
     def close(self) -> None:
         """Close the file; twice does no harm."""
         self._closed = True
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
 
 
 def check_same_topology(path: Path, stored: Scene, scene: Scene) -> None:

@@ -7,13 +7,13 @@ from __future__ import annotations
 
 import weakref
 from collections.abc import Sequence
-from contextlib import closing
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
+from systems.chemistry.distance_bonds import lengths_and_angles
 from systems.errors import InputError, TrajectoryError
 from systems.files.whole_file import OutputLock, journal_path
 from systems.scene import Scene
@@ -145,8 +145,6 @@ def to_mdtraj(
     for a damaged one."""
     import mdtraj
 
-    from systems.chemistry.distance_bonds import lengths_and_angles
-
     scene, positions, times, cells = _read(source, start, stop, stride)
     lengths, angles = (None, None) if cells is None else lengths_and_angles(cells)
     return mdtraj.Trajectory(
@@ -162,8 +160,6 @@ def to_mdanalysis(
     step: frames that are unevenly spaced are refused. Raises InputError, TrajectoryError."""
     import MDAnalysis
     from MDAnalysis.coordinates.memory import MemoryReader
-
-    from systems.chemistry.distance_bonds import lengths_and_angles
 
     scene, positions, times, cells = _read(source, start, stop, stride)
     gaps = np.diff(times)
@@ -235,5 +231,5 @@ def write_weights(path: Path, weights: Float64Array) -> None:
     """Write weights `(n_frames,)` into a trajectory of ours, or replace them. Raises InputError for another number of
     them, TrajectoryError for a file of others, StorageError."""
     store = meta_path(path) if path.suffix.lower() in POSITIONS_ALONE else path
-    with closing(FrameStore(store)) as file:
+    with FrameStore(store) as file:
         file.write_weights(np.asarray(weights, dtype=np.float64))

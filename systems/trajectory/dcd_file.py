@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import os
 import warnings
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -23,19 +22,10 @@ import numpy.typing as npt
 
 from systems.chemistry.distance_bonds import lengths_and_angles, read_cells
 from systems.errors import TrajectoryError
-from systems.files.whole_file import write_whole
+from systems.files.whole_file import create_whole, write_whole
 from systems.scene import Scene
 from systems.trajectory.companion_writer import is_our_topology, meta_path, topology_path
-from systems.trajectory.store import (
-    CELLS,
-    ENDS,
-    FRAMES,
-    Columns,
-    Float32Array,
-    Float64Array,
-    FrameBlock,
-    add_column,
-)
+from systems.trajectory.store import CELLS, ENDS, FRAMES, Columns, Float32Array, Float64Array, FrameBlock
 from systems.trajectory.xtc_file import CompanionReader, CompanionWriter, check_size, is_of_xtc
 
 AKMA_PS = 4.888821e-2  # the value MDAnalysis and OpenMM use for CHARMM's unit of time
@@ -88,18 +78,10 @@ class DcdLayout:
         self.states_time = has_step and not is_lammps and not (delta == 1.0 and fields[2] == 1)
         self.interval_ps = self.interval_ps if has_step else 1.0
         self.first_time_ps = self.interval_ps * fields[1] / every
-        # One frame, block lengths included.
+        # One frame: x, y and z between block lengths.
+        axis = [("before", f"{order}i4"), ("x", f"{order}f4", (self.n_atoms,)), ("after", f"{order}i4")]
         cell = [("cell", f"{order}i4", (14,))] if self.has_cell else []
-        axes = [
-            entry
-            for k in range(3)
-            for entry in (
-                (f"before{k}", f"{order}i4"),
-                (f"x{k}", f"{order}f4", (self.n_atoms,)),
-                (f"after{k}", f"{order}i4"),
-            )
-        ]
-        self.frame_dtype = np.dtype([*cell, *axes])
+        self.frame_dtype = np.dtype([*cell, ("axes", axis, (3,))])
 
     def offset(self, frame: int) -> int:
         return self.first_frame_at + frame * self.frame_dtype.itemsize
@@ -207,11 +189,9 @@ class DcdWriter(CompanionWriter):
 
     _layout: DcdLayout
 
-    def _lay_out(self, file: h5py.File, scene: Scene, columns: Sequence[str]) -> None:
-        add_column(file, "time", 0, "<f8")
-
-    def _head(self, scene: Scene) -> bytes:
-        return header_bytes(0, 0, 1, 0.0, has_cell=scene.cell_nm is not None) + title_bytes(scene.n_atoms)
+    def _begin(self, path: Path, scene: Scene) -> None:
+        head = header_bytes(0, 0, 1, 0.0, has_cell=scene.cell_nm is not None)
+        create_whole(path, head + title_bytes(scene.n_atoms))
 
     def _adopt(self) -> None:
         self._layout = layout = DcdLayout(self.path)
@@ -227,9 +207,9 @@ class DcdWriter(CompanionWriter):
         frames = np.empty(len(block), dtype=self._layout.frame_dtype)
         angstrom = block.positions_nm * np.float32(10.0)
         stored: Columns = {FRAMES: angstrom}
-        for axis in range(3):
-            frames[f"before{axis}"] = frames[f"after{axis}"] = 4 * self.scene.n_atoms
-            frames[f"x{axis}"] = angstrom[:, :, axis]
+        axes = frames["axes"]
+        axes["before"] = axes["after"] = 4 * self.scene.n_atoms
+        axes["x"] = angstrom.transpose(0, 2, 1)
         if block.cell_nm is not None:
             stored[CELLS] = frames["cell"] = cell_blocks(block.cell_nm)
         return frames.tobytes(), {}, stored
@@ -268,14 +248,14 @@ class DcdReader(CompanionReader):
                 self.scene = stated
 
     def _read(self, start: int, stop: int, stride: int) -> Float32Array:
-        frames = self._frames[start:stop:stride]
-        out = np.empty((len(frames), self.n_atoms, 3), dtype=np.float32)
-        for axis in range(3):
-            lengths = (frames[f"before{axis}"] == 4 * self.n_atoms) & (frames[f"after{axis}"] == 4 * self.n_atoms)
-            if not lengths.all():
-                bad = start + stride * int(np.argmin(lengths))
-                raise TrajectoryError(f"{self.path} is damaged at frame {bad}; restore it from a whole copy.")
-            out[:, :, axis] = frames[f"x{axis}"]
+        axes, n_bytes = self._frames["axes"][start:stop:stride], 4 * self.n_atoms
+        lengths = ((axes["before"] == n_bytes) & (axes["after"] == n_bytes)).all(axis=1)
+        if not lengths.all():
+            bad = start + stride * int(np.argmin(lengths))
+            raise TrajectoryError(f"{self.path} is damaged at frame {bad}; restore it from a whole copy.")
+        out = np.empty((len(axes), self.n_atoms, 3), dtype=np.float32)
+        for k in range(3):  # sooner done than the three at once
+            out[:, :, k] = axes["x"][:, k]
         self._check_read(FRAMES, out, slice(start, stop, stride))
         out *= np.float32(0.1)
         return out

@@ -116,9 +116,6 @@ def format_of(path: Path) -> Format:
 # ---- scenes from topologies -----------------------------------------------------------------------------------------
 
 
-_NM_PER_ANGSTROM = 0.1
-
-
 def scene_from_mdtraj_topology(
     topology: Any,
     positions_nm: npt.ArrayLike,
@@ -225,14 +222,12 @@ def scene_from_universe(top: Path, *, name: str) -> Scene:
         raise InputError(f"{top} cannot be read as a topology: {first_line(error)}.") from error
     atoms = universe.atoms
     has_positions = hasattr(universe, "trajectory") and universe.trajectory.n_frames > 0
-    positions = (
-        np.asarray(atoms.positions, dtype=np.float64) * _NM_PER_ANGSTROM if has_positions else np.zeros((len(atoms), 3))
-    )
-    names = [str(x) for x in _values(atoms, "names", _values(atoms, "types", ["X"] * len(atoms)))]
-    residues = [str(x) for x in _values(atoms.residues, "resnames", ["UNK"] * len(atoms.residues))]
-    of_atom = np.asarray(atoms.resindices, dtype=np.int64)
-    of_atom = np.unique(of_atom, return_inverse=True)[1].astype(np.int64)
-    written = [str(x) for x in _values(atoms, "elements", [""] * len(atoms))]
+    angstrom = atoms.positions if has_positions else np.zeros((len(atoms), 3))
+    # What the topology does not say is an AttributeError of MDAnalysis.
+    names = [str(x) for x in getattr(atoms, "names", getattr(atoms, "types", ["X"] * len(atoms)))]
+    residues = [str(x) for x in getattr(atoms.residues, "resnames", ["UNK"] * len(atoms.residues))]
+    of_atom = np.unique(atoms.resindices, return_inverse=True)[1].astype(np.int64)
+    written = [str(x) for x in getattr(atoms, "elements", [""] * len(atoms))]
     elements = []
     for i, (atom, element) in enumerate(zip(names, written, strict=True)):
         # XYZ files hold symbols or PDB names: CA in capitals is an alpha carbon, which MDAnalysis takes for calcium.
@@ -244,8 +239,9 @@ def scene_from_universe(top: Path, *, name: str) -> Scene:
     bonds = np.empty((0, 2), dtype=np.int64)
     if hasattr(atoms, "bonds"):
         bonds = np.unique(np.sort(np.asarray(atoms.bonds.to_indices()).reshape(-1, 2), axis=1), axis=0).astype(np.int64)
-    ids = [str(x) for x in _values(atoms.residues, "resids", range(1, len(residues) + 1))]
-    scene = _scene_of_names(top, names, elements, positions, of_atom, residues, ids, bonds)
+    ids = [str(x) for x in getattr(atoms.residues, "resids", range(1, len(residues) + 1))]
+    positions_nm = np.asarray(angstrom, dtype=np.float64) * _NM["angstrom"]
+    scene = _scene_of_names(top, names, elements, positions_nm, of_atom, residues, ids, bonds)
     return with_orders(with_bonds_by_distance(replace(scene, name=name)))
 
 
@@ -316,10 +312,3 @@ def with_orders(scene: Scene) -> Scene:
     except ValenceError:
         return scene
     return replace(scene, bond_orders=orders, formal_charges=charges)
-
-
-def _values(group: Any, name: str, otherwise: Any) -> Any:
-    try:
-        return getattr(group, name)
-    except Exception:  # MDAnalysis' NoDataError: the topology does not say
-        return otherwise

@@ -77,7 +77,6 @@ class Hdf5Writer(TrajectoryWriter):
         periodic = scene.cell_nm is not None
         for name in ("coordinates", *columns):
             add_column(file, name, 0, "<f4", tail=(scene.n_atoms, 3), chunk=chunk)
-        add_column(file, "time", 0, "<f8")
         for name in ("cell_lengths", "cell_angles") if periodic else ():
             add_column(file, name, 0, "<f4", tail=(3,))
         for name, (units, unit, _) in _UNITS.items():

@@ -28,6 +28,7 @@ from systems.files.outside import UNREADABLE, open_checked
 from systems.files.schema import fitted, parsed
 from systems.files.whole_file import (
     AtomicFile,
+    Closing,
     checksum_rows,
     create_whole,
     frame_checksums,
@@ -234,6 +235,7 @@ def create_store(
         group.create_group("scalars")
         set_text(group, "record", sealed(json_text(record, "record")), _RECORD_BYTES)
         set_text(group, "scene", sealed(json_text(scene.to_dict(), "scene")))
+        add_column(file, "time", 0, "<f8")
         add_column(file, "surromd/chunk_idx", 0, "<i4")
         for name in (FRAMES, *columns, *([] if scene.cell_nm is None else [CELLS])):
             add_column(file, f"{CHECKSUMS}/{name}", 0, "<u4")
@@ -321,7 +323,7 @@ def read_run_id(file: h5py.File) -> str:
     return file["surromd/run_id"][()].decode("ascii") if "surromd/run_id" in file else ""
 
 
-class FrameStore:
+class FrameStore(Closing):
     """Appends to a file made by `create_store`, one transaction per append. Raises TrajectoryError when the file is
     damaged or not ours (this version's), StorageError."""
 

@@ -58,13 +58,6 @@ class CompanionWriter(TrajectoryWriter):
     def _store_of(path: Path) -> Path:
         return meta_path(path)
 
-    def _begin(self, path: Path, scene: Scene) -> None:
-        create_whole(path, self._head(scene))
-
-    @abstractmethod
-    def _head(self, scene: Scene) -> bytes:
-        """Return what a file without frames holds."""
-
     @abstractmethod
     def _encoded(self, block: FrameBlock) -> tuple[bytes, Columns, Columns]:
         """Return a block as the file has it, the columns that go with it, and what has a checksum (`FrameStore`).
@@ -168,11 +161,10 @@ class XtcWriter(CompanionWriter):
     """Writes an XTC and its companions; see `systems.trajectory.codec.open_writer` for the arguments and errors."""
 
     def _lay_out(self, file: h5py.File, scene: Scene, columns: Sequence[str]) -> None:
-        add_column(file, "time", 0, "<f8")
         add_column(file, ENDS, 0, "<i8")
 
-    def _head(self, scene: Scene) -> bytes:
-        return b""
+    def _begin(self, path: Path, scene: Scene) -> None:
+        create_whole(path, b"")
 
     def _adopt(self) -> None:
         if ENDS not in self.file:

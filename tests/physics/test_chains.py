@@ -100,7 +100,7 @@ def test_a_template_gives_each_term_of_the_molecule_it_was_made_of(name: str) ->
     from openmm import app
 
     scene = load(name)
-    template = make_template(cap(scene, 0), "MOL-1")
+    template = make_template(*cap(scene, 0), "MOL-1")
     ours = app.ForceField(io.StringIO(template)).createSystem(scene.to_openmm_topology(), removeCMMotion=False)
     x = scene.positions_nm + 0.005 * np.random.default_rng(0).normal(size=scene.positions_nm.shape)
     theirs = energy_terms(build_system(scene, ForceFieldSpec("gaff2", "vacuum", None, False)), x)
@@ -128,8 +128,8 @@ def test_only_the_residue_without_a_template_is_charged_anew(aib_chain: Any) -> 
     scene, chain, system = aib_chain
     assert resolve(scene, ForceFieldSpec("auto", "auto")).force_field == "ff14SB+gaff2"
     assert len(chain.unknown) == 1
-    capped = cap(chain.scene, chain.unknown[0])
-    assert (capped.scene.formula, capped.n_own) == ("C7H14N2O2", 13)  # ACE-AIB-NME
+    capped, n_own = cap(chain.scene, chain.unknown[0])
+    assert (capped.formula, n_own) == ("C7H14N2O2", 13)  # ACE-AIB-NME
     force = next(f for f in system.getForces() if isinstance(f, NonbondedForce))
     charges_e = np.array([force.getParticleParameters(i)[0]._value for i in range(scene.n_atoms)])
     residue = chain.scene.residue_of_atom[np.argsort(chain.order)]
@@ -181,8 +181,8 @@ def test_a_missing_term_is_refused(aib_chain: Any, monkeypatch: pytest.MonkeyPat
 
     from md_reference.forces import nonstandard as module
 
-    def with_a_hole(capped: Any, name: str) -> str:
-        return re.sub(r"<Angle [^>]*/>", "", make_template(capped, name), count=1)
+    def with_a_hole(capped: Scene, n_own: int, name: str) -> str:
+        return re.sub(r"<Angle [^>]*/>", "", make_template(capped, n_own, name), count=1)
 
     monkeypatch.setattr(module, "make_template", with_a_hole)
     with pytest.raises(PreparationError, match=r"no parameters for .* angles"):

@@ -211,8 +211,7 @@ def test_stiff_bonds_of_a_frame_relax_on_a_copy_of_the_system() -> None:
     potential = Potential(scene)
     with Relaxer(scene, build_quantum_system(scene), platform="Reference", born=False) as relaxer:
         found = relaxer.relax(stretched)
-    assert found.potential_kj_mol == pytest.approx(potential(found.positions_nm)[0], abs=1e-4)
-    assert found.potential_kj_mol < potential(stretched)[0] - 10.0
+    assert potential(found)[0] < potential(stretched)[0] - 10.0
 
 
 def test_an_scf_that_fails_without_a_word_is_told(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -40,7 +40,7 @@ def test_what_a_program_says_and_how_it_ended(tmp_path: Path) -> None:
 def test_a_failure_of_ambertools_is_said_in_its_own_words(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "bad").write_text("#!/bin/sh\necho 'Error: no such atom type'\nexit 3\n")
     (tmp_path / "bad").chmod(0o755)
-    monkeypatch.setattr(programs, "ambertools", lambda: programs.AmberTools(tmp_path, "test", "test"))
+    monkeypatch.setattr(programs, "ambertools", lambda: programs.AmberTools(tmp_path, "test", "test", tmp_path))
     with pytest.raises(PreparationError, match="bad failed: Error: no such atom type"):
         programs.run("bad", [], tmp_path)
 
