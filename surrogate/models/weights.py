@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import platform
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -28,6 +28,23 @@ _LEAST_SIZE = 1_000_000
 
 
 @dataclass(frozen=True)
+class Chemistry:
+    """Molecules that a potential trained on many covers: of these elements, at most so many atoms, charges in e from
+    the least to the greatest, where its members' forces spread by at most `spread_kj_mol_nm`
+    (`PainetPotential.spread`)."""
+
+    elements: tuple[str, ...]
+    n_atoms: int
+    charges: tuple[int, int]
+    spread_kj_mol_nm: float
+
+    def describe(self) -> str:
+        """Return 'molecules of H, C, N, O with up to 50 atoms, charges -1 to 1'."""
+        least, most = self.charges
+        return f"molecules of {', '.join(self.elements)} with up to {self.n_atoms} atoms, charges {least} to {most}"
+
+
+@dataclass(frozen=True)
 class TrainingDomain:
     """The training domain of weights. `scene` is the template: atom k of the model is its atom k, and canonical
     frames are superposed on its positions. `conditions`: of the reference (force field, temperature_k, ...);
@@ -35,7 +52,8 @@ class TrainingDomain:
 
     `lag_ps`: between frames, the shortest where the model takes a lag; `jumps` are then rows (lag, least and greatest
     jump) that stand for those of `limits` at each lag. `further`: the domains of other molecules trained on.
-    `transferable`: other peptides of such residues are covered too (`sampling.domain`).
+    `transferable`: other molecules are covered too (`sampling.domain`): those that `chemistry` says, or peptides of
+    such residues.
     """
 
     scene: Scene
@@ -46,6 +64,7 @@ class TrainingDomain:
     jumps: tuple[tuple[float, float, float], ...] = ()
     further: tuple[TrainingDomain, ...] = ()
     transferable: bool = False
+    chemistry: Chemistry | None = None
 
     @property
     def members(self) -> tuple[TrainingDomain, ...]:
@@ -61,7 +80,9 @@ class TrainingDomain:
         leave empty is left out."""
         out: dict[str, Any] = {**vars(self), "scene": self.scene.to_dict()}
         out["further"] = [domain.to_dict() for domain in self.further]
-        return {key: value for key, value in out.items() if value or key not in ("jumps", "further", "transferable")}
+        out["chemistry"] = None if self.chemistry is None else asdict(self.chemistry)
+        empty = ("jumps", "further", "transferable", "chemistry")
+        return {key: value for key, value in out.items() if value or key not in empty}
 
     def describe(self) -> str:
         """One line for people: 'alanine-dipeptide (C6H12N2O2, 22 atoms), ff14SB/obc2, 300 K, frames 1 ps apart'."""
@@ -72,6 +93,7 @@ class TrainingDomain:
             more = f" and {len(names) - 6} more" if len(names) > 6 else ""
             what = f"{len(names)} molecules ({', '.join(names[:6])}{more})"
         what += " and molecules like them" if self.transferable else ""
+        what = what if self.chemistry is None else self.chemistry.describe()
         md = f"{f}/{c.get('solvent')}, {c.get('temperature_k')} K" if (f := c.get("force_field")) else "unknown MD"
         return f"{what}, {md}, frames {lags} ps apart"
 

@@ -135,12 +135,17 @@ class PotentialChecks:
         # Infinity where training did not measure them.
         error, spread = (float(weights.provenance.get(name, np.inf)) for name in ("energy_mae", "energy_spread"))
         self._wrong_kj_mol, self._unsure_kj_mol = WRONG_TIMES * error, UNSURE_TIMES * spread
+        # Members that never saw the molecule have each a zero of energy of their own for it.
+        start = torch.tensor(weights.domain.scene.positions_nm, dtype=torch.float64)
+        with torch.no_grad():
+            zero = self._model.energies(start[None], self._molecule)
+        self._zero_kj_mol = torch.zeros_like(zero) if weights.domain.limits is not None else zero
 
     def unsure(self, frames_nm: FloatArray) -> npt.NDArray[np.bool_]:
         """Frames `(b, n, n_atoms, 3)` nm -> `(b, n)`; frames that are not finite are the other checks' to find."""
         flat = torch.from_numpy(frames_nm.reshape(-1, *frames_nm.shape[2:]).astype(np.float64))
         with torch.no_grad():
-            spread = self._model.energies(flat, self._molecule).std(-1, correction=0)
+            spread = (self._model.energies(flat, self._molecule) - self._zero_kj_mol).std(-1, correction=0)
         found: npt.NDArray[np.bool_] = (spread > self._unsure_kj_mol).numpy().reshape(frames_nm.shape[:2])
         return found
 

@@ -8,21 +8,24 @@ from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
+import networkx as nx
 import numpy as np
 import numpy.typing as npt
 import torch
 
 from surrogate.data import in_standard_pose
 from surrogate.models.architecture import architecture, shipped_weights
+from surrogate.models.painet.energy import PainetPotential
 from surrogate.models.peptides.chains import FREE_ENDS
 from surrogate.models.peptides.layout import PeptideConfig, chain_features, standard_peptide
 from surrogate.models.peptides.model import PeptideSlide
 from surrogate.models.potential import Potential
-from surrogate.models.weights import TrainingDomain, Weights, load_weights, read_header
+from surrogate.models.propagator import draw_noise
+from surrogate.models.weights import Chemistry, TrainingDomain, Weights, load_weights, read_header
 from systems.chemistry.graph import match_atoms
 from systems.chemistry.validity import INVALID, NOT_FINITE, Geometry, check_frames, flag_names, geometry_from_scene
 from systems.errors import InputError, OutOfDomainError
-from systems.scene import Scene
+from systems.scene import ATOMIC_NUMBERS, Scene
 from systems.units import format_time_ps
 
 if TYPE_CHECKING:
@@ -125,6 +128,56 @@ def _n_amino_acids(scene: Scene) -> int:
     return sum(name not in _CAPS for name in scene.residue_names)
 
 
+# Copies of a molecule and chunks of MD on a potential by which its members are asked whether they know it.
+_ASKED_COPIES, _ASKED_CHUNKS = 16, 2
+
+
+def cover_molecule(scene: Scene, domain: TrainingDomain, known: Chemistry) -> tuple[TrainingDomain, list[Deviation]]:
+    """Return the domain of a molecule that a potential was not trained on, and how it leaves the training: another
+    element, a charge beyond those trained on, an odd number of electrons or several molecules cannot be forced, more
+    atoms can. A valid frame has the bond lengths of the scene."""
+    charge = int(scene.formal_charges.sum())
+    electrons = sum(ATOMIC_NUMBERS.get(e, 0) for e in scene.elements) - charge
+    graph = nx.Graph(scene.bonds.tolist())
+    graph.add_nodes_from(range(scene.n_atoms))
+    least, most = known.charges
+    reasons = [
+        f"holds {', '.join(others)}" if (others := sorted(set(scene.elements) - set(known.elements))) else "",
+        f"bears a charge of {charge:+d} e" if not least <= charge <= most else "",
+        "has an odd number of electrons" if electrons % 2 else "",
+        f"is {n} molecules" if (n := nx.number_connected_components(graph)) > 1 else "",
+    ]
+    found = [Deviation("molecule", " and ".join(filter(None, reasons)), forcible=False)] if any(reasons) else []
+    if scene.n_atoms > known.n_atoms:
+        found.append(Deviation("size", f"{scene.n_atoms} atoms; trained on up to {known.n_atoms}", forcible=True))
+    own = replace(
+        domain, scene=in_standard_pose(scene), geometry=geometry_from_scene(scene).to_dict(), limits=None, further=(),
+        transferable=False, chemistry=None,
+    )  # fmt: skip
+    return own, found
+
+
+def _doubts(scene: Scene, model: PainetPotential, known: Chemistry) -> tuple[Deviation, ...]:
+    """Return the deviation of a molecule that MD on a potential does not keep whole, or on whose forces its members
+    disagree in that MD."""
+    molecule, seeds = model.featurise(scene), range(_ASKED_COPIES)
+    x = torch.tensor(scene.positions_nm, dtype=torch.float32).expand(_ASKED_COPIES, 1, -1, -1)
+    generators = [torch.Generator().manual_seed(seed) for seed in seeds]
+    v = None
+    for _ in range(_ASKED_CHUNKS):
+        chunk = model.next_chunk(x, molecule, draw_noise(model, scene.n_atoms, generators), last_velocities_nm_ps=v)
+        x, v = chunk.frames_nm[:, -1:], chunk.velocities_nm_ps
+    if n_lost := int((check_frames(x[:, 0].numpy(), geometry_from_scene(scene)) & INVALID > 0).sum()):
+        reason = f"{n_lost} of {len(x)} replicas of MD on it do not stay this molecule"
+    elif (spread := float(model.spread(x[:, 0], molecule).median())) > known.spread_kj_mol_nm:
+        reason = (
+            f"members' forces differ by {spread:.3g} kJ/mol/nm in MD on it; {known.spread_kj_mol_nm:.3g} is trusted"
+        )
+    else:
+        return ()
+    return (Deviation("spread", reason, forcible=True),)
+
+
 _ROUNDING = 1e-6
 # How near atoms of a start may come, of how near those of frames may.
 _ROOM_OF_START = 0.85
@@ -207,8 +260,14 @@ def match_domain(
 
     Raises OutOfDomainError, which says how the scene differs, what the weights cover and what to run instead.
     """
-    return match_known(scene, weights.domain, weights.path.name, _peptides(weights.model),
-                       temperature_k=temperature_k, force=force)  # fmt: skip
+    name, known = weights.path.name, weights.domain.chemistry
+    match = match_known(scene, weights.domain, name, _peptides(weights.model), temperature_k=temperature_k,
+                        force=force)  # fmt: skip
+    if known is None or match.seen:
+        return match
+    assert isinstance(weights.model, PainetPotential)
+    found = replace(match, deviations=(*match.deviations, *_doubts(scene, weights.model, known)))
+    return _refused(scene, found, weights.domain, name, force=force)
 
 
 def match_known(
@@ -217,7 +276,11 @@ def match_known(
 ) -> DomainMatch:  # fmt: skip
     """`match_domain` for weights that are not loaded; `peptides`: the settings of a model that knows peptides by their
     residues."""
-    found = _compare(scene, domain, peptides, temperature_k)
+    return _refused(scene, _compare(scene, domain, peptides, temperature_k), domain, name, force=force)
+
+
+def _refused(scene: Scene, found: DomainMatch, domain: TrainingDomain, name: str, *, force: bool) -> DomainMatch:
+    """Return the match where nothing speaks against it. Raises OutOfDomainError."""
     deviations = found.deviations
     barred = [d for d in deviations if not d.forcible]
     if not barred and (force or not deviations):
@@ -274,6 +337,10 @@ def _compare(
         found = list(beyond)
         new = unseen_neighbours(own.scene, domain) if not any(not d.forcible for d in found) else []
         nearness = f"residues that it never saw side by side: {', '.join(new)}" if new else "each pair of residues seen"
+    elif member is None and domain.chemistry is not None:
+        own, found = cover_molecule(scene, domain, domain.chemistry)
+        order = np.arange(scene.n_atoms)
+        nearness = "its members agree on forces of it"
     elif member is None:
         found = [Deviation("molecule", "another one than those trained on", forcible=False)]
     else:
@@ -320,6 +387,8 @@ def choose_weights(
         peptides = config if isinstance(config, PeptideConfig) else None
         try:
             match = match_known(scene, header.domain, path.name, peptides, temperature_k=temperature_k)
+            if header.domain.chemistry is not None:
+                match_domain(scene, load_weights(path), temperature_k=temperature_k)
         except OutOfDomainError as error:
             refusals.append((not error.forcible, len(error.args[0].split("; ")), name, error))
             continue

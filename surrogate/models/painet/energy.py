@@ -633,6 +633,15 @@ class PainetPotential(Potential):
             totals = self.members(x, topology).sum(0)
             return -torch.stack([torch.autograd.grad(total, x, retain_graph=True)[0] for total in totals])
 
+    def spread(self, positions_nm: Tensor, molecule: Molecule) -> Tensor:
+        """Frames `(rows, n_atoms, 3)` nm -> `(rows,)` kJ/mol/nm, the root mean square deviation of the members' forces
+        from their mean, the largest of a frame's atoms."""
+        found = []
+        for part in positions_nm.double().split(256):
+            forces = self.member_forces(part, self.topology(molecule))
+            found.append((forces - forces.mean(0)).square().sum(-1).mean(0).sqrt().amax(-1))
+        return torch.cat(found)
+
     def gradient(self, positions_nm: Tensor, molecule: Molecule) -> GradientFn:
         """Return what computes the members' energies and their mean's gradient at frames like these: by SIMD where
         they run, else by torch."""

@@ -297,18 +297,11 @@ class Learner:
         order = np.random.default_rng(seed).permutation(len(pool))
         any_ = pool[order[: n // 2]]
         rest = pool[order[n // 2 :]]
-        spread = self.spread(torch.from_numpy(rest))
-        unsure = rest[np.argsort(-spread)[: n - len(any_)]]
+        spread = torch.nan_to_num(self.model.spread(torch.from_numpy(rest), self.molecule), nan=0.0)
+        unsure = rest[np.argsort(-spread.numpy())[: n - len(any_)]]
         self._label(any_, held=2 * self.config.held_share)
         self._label(unsure, held=0.0)
         self._labelling_s, self._labelled = self._labelling_s + time.monotonic() - began, self._labelled + n
-
-    def spread(self, positions_nm: Tensor) -> Any:
-        """Root mean square deviation of the members' forces from their mean, the largest of each state's atoms, `(n,)`
-        in kJ/mol/nm."""
-        parts = [self.model.member_forces(part, self.topology) for part in positions_nm.double().split(256)]
-        deviation = torch.cat([(p - p.mean(0)).square().sum(-1).mean(0).sqrt().amax(-1) for p in parts])
-        return torch.nan_to_num(deviation, nan=0.0).numpy()
 
     def _own_states(self, replicas: int, seed: int) -> Any:
         """Return finite states `(n, n_atoms, 3)` of short rollouts from samples, at the temperatures of hot MD."""
@@ -364,15 +357,15 @@ def samples_path(out: Path) -> Path:
 
 
 def learn_potential(
-    reference: ReferenceForces, out: Path, model_config: PotentialConfig, config: PotentialTraining, *,
-    start: Weights | None = None, resume: bool = False, progress: loop.ProgressFn | None = None, before_s: float = 0.0,
-    after_s: float = 0.0,
+    reference: ReferenceForces, out: Path, network: PotentialConfig | Weights, config: PotentialTraining, *,
+    resume: bool = False, progress: loop.ProgressFn | None = None, before_s: float = 0.0, after_s: float = 0.0,
 ) -> Path:  # fmt: skip
     """Learn a molecule's energies and forces and write weights `out`; beside them stay the samples and the curves
-    (.csv). The network begins as that of `start`, whose configuration is then `model_config`. Of the budget `before_s`
-    are spent already, and `after_s` are wanted by the caller, for later."""
+    (.csv). `network`: the settings of a new one, or weights to begin with. Of the budget `before_s` are spent already,
+    and `after_s` are wanted by the caller, for later."""
     began = time.monotonic() - before_s
     torch.manual_seed(config.seed)
+    start, model_config = (None, network) if isinstance(network, PotentialConfig) else (network, network.model.config)
     model = PainetPotential(model_config)
     if start is not None:
         model.load_state_dict(start.model.state_dict())
@@ -436,9 +429,9 @@ class PotentialTrainer(arch.Trainer):
               before_s: float = 0.0, after_s: float = 0.0) -> Path:  # fmt: skip
         """Learn a molecule from its reference, as the request has it, and return the weights; see `learn_potential`."""
         settings = self.settings(request)
-        start = None if request.start_from is None else load_weights(request.start_from)
+        network = settings.model if request.start_from is None else load_weights(request.start_from)
         return learn_potential(
-            reference, request.out, settings.model, settings.training, start=start, resume=request.resume,
+            reference, request.out, network, settings.training, resume=request.resume,
             progress=lambda stage, share, metrics: advance(stage, share), before_s=before_s, after_s=after_s,
         )  # fmt: skip
 

@@ -101,9 +101,9 @@ def test_it_begins_with_what_other_weights_know(tmp_path: Path) -> None:
     learn_potential(Springs(), known, SMALL, replace(QUICK, steps=100, learning_rate=5e-3, matrix_rate=0.05))
     few = replace(QUICK, steps=2, learning_rate=1e-5, matrix_rate=1e-5)
     found = {}
-    for name, start in (("fresh", None), ("pretrained", load_weights(known))):
+    for name, network in (("fresh", SMALL), ("pretrained", load_weights(known))):
         out = tmp_path / f"{name}.safetensors"
-        learn_potential(Springs(zero_kj_mol=900.0), out, SMALL, few, start=start)
+        learn_potential(Springs(zero_kj_mol=900.0), out, network, few)
         found[name] = load_weights(out)
     fresh, pretrained = (found[name].provenance for name in ("fresh", "pretrained"))
     assert pretrained["force_rms"] < 0.4 * fresh["force_rms"]
@@ -158,7 +158,8 @@ def test_where_members_differ_is_where_the_model_knows_least(tmp_path: Path) -> 
         optimiser.step()
     near = torch.from_numpy(reference.explore(20, (300.0,), seed=9))
     far = near + 0.03 * torch.randn(near.shape, generator=generator, dtype=near.dtype)
-    assert np.median(learner.spread(far)) > 1.3 * np.median(learner.spread(near))
+    far_kj, near_kj = (np.median(learner.model.spread(x, learner.molecule)) for x in (far, near))
+    assert far_kj > 1.3 * near_kj
 
 
 def test_an_interrupted_training_goes_on(tmp_path: Path) -> None:

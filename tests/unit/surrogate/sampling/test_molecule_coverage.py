@@ -1,0 +1,103 @@
+"""A potential trained on many molecules: which others it covers, and when its own members refuse one."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from surrogate.api import info, rollout
+from surrogate.models import architecture
+from surrogate.models.weights import Chemistry, Weights, load_weights, read_header, save_weights
+from surrogate.sampling import domain as coverage
+from surrogate.sampling.domain import choose_weights, match_domain
+from systems.errors import OutOfDomainError
+from systems.library.named_scenes import prepare
+from systems.trajectory.codec import open_trajectory
+
+TRUSTED = Chemistry(("C", "H", "N", "O"), 24, (-1, 0), 1e4)
+
+
+@pytest.fixture(scope="module")
+def alanine() -> Weights:
+    return load_weights(architecture.shipped_weights()["alanine-dipeptide-gfn2-xtb"])
+
+
+@pytest.fixture
+def general(tmp_path: Path, alanine: Weights) -> Weights:
+    """One molecule's potential that takes itself for one of many."""
+    return saved(tmp_path / "general.safetensors", alanine, TRUSTED)
+
+
+def saved(path: Path, weights: Weights, chemistry: Chemistry) -> Weights:
+    domain = replace(weights.domain, transferable=True, chemistry=chemistry)
+    save_weights(path, weights.model, domain, weights.provenance)
+    return load_weights(path)
+
+
+def test_a_file_keeps_what_is_covered(general: Weights, alanine: Weights) -> None:
+    assert read_header(general.path).domain.chemistry == TRUSTED
+    assert "molecules of C, H, N, O with up to 24 atoms, charges -1 to 0, gfn2-xtb/vacuum" in general.domain.describe()
+    assert alanine.domain.chemistry is None and "chemistry" not in alanine.domain.to_dict()
+
+
+@pytest.mark.parametrize(
+    ("smiles", "reason"),
+    [
+        ("CCS", "holds S"),
+        ("CC[NH3+]", "bears a charge of \\+1 e"),
+        ("C[CH2]", "has an odd number of electrons"),
+        ("CS[CH2]", "holds S and has an odd number of electrons"),
+    ],
+)
+def test_other_chemistry_is_refused_and_cannot_be_forced(general: Weights, smiles: str, reason: str) -> None:
+    scene = prepare(f"smiles:{smiles}")
+    with pytest.raises(OutOfDomainError, match=rf"molecule: {reason}\. .*cover molecules of C, H, N, O"):
+        match_domain(scene, general, force=True)
+
+
+def test_more_atoms_can_be_forced(general: Weights) -> None:
+    scene = prepare("smiles:CCCCCCCC")
+    with pytest.raises(OutOfDomainError, match="size: 26 atoms; trained on up to 24"):
+        match_domain(scene, general)
+    assert [d.what for d in match_domain(scene, general, force=True).deviations] == ["size"]
+
+
+def test_where_members_disagree_it_is_refused_with_the_spread(tmp_path: Path, alanine: Weights) -> None:
+    scene = prepare("smiles:CNC(C)=O")
+    strict = saved(tmp_path / "strict.safetensors", alanine, replace(TRUSTED, spread_kj_mol_nm=1.0))
+    with pytest.raises(OutOfDomainError, match=r"forces differ by 1\.\d+ kJ/mol/nm in MD on it; 1 is trusted"):
+        match_domain(scene, strict)
+    (found,) = match_domain(scene, strict, force=True).deviations
+    assert found.what == "spread" and found.forcible
+    assert info(strict.path, "smiles:CNC(C)=O")["covered"] == "only with force"
+    # The molecule that it was trained on is never asked.
+    assert match_domain(prepare("alanine-dipeptide"), strict).seen
+
+
+def test_a_molecule_that_flies_apart_is_refused(general: Weights) -> None:
+    with pytest.raises(OutOfDomainError, match="spread: 16 of 16 replicas of MD on it do not stay this molecule"):
+        match_domain(prepare("smiles:CCO"), general)
+
+
+def test_two_molecules_are_not_one(general: Weights) -> None:
+    scene = prepare("smiles:CCO")
+    cut = replace(scene, bonds=scene.bonds[1:], bond_orders=scene.bond_orders[1:])
+    with pytest.raises(OutOfDomainError, match="molecule: is 2 molecules"):
+        match_domain(cut, general, force=True)
+
+
+def test_a_molecule_on_which_they_agree_is_rolled(
+    tmp_path: Path, general: Weights, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(coverage, "shipped_weights", lambda: {"general": general.path})
+    weights, why = choose_weights(prepare("smiles:CNC(C)=O"), conditions={"force_field": "gfn2-xtb"})
+    assert weights.hash == general.hash and "without having seen it" in why
+    (out,) = rollout("smiles:CNC(C)=O", general.path, tmp_path / "out.h5", time_ps="2ps", quiet=True)
+    with open_trajectory(out) as reader:
+        assert reader.n_frames == 20 and not reader.flags.any()
+    strict = saved(tmp_path / "strict.safetensors", general, replace(TRUSTED, spread_kj_mol_nm=1.0))
+    monkeypatch.setattr(coverage, "shipped_weights", lambda: {"strict": strict.path})
+    with pytest.raises(OutOfDomainError, match=r"no shipped weights cover .*; 1 is trusted"):
+        choose_weights(prepare("smiles:CNC(C)=O"))
