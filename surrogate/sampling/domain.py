@@ -157,19 +157,27 @@ def cover_molecule(scene: Scene, domain: TrainingDomain, known: Chemistry) -> tu
     return own, found
 
 
-def _doubts(scene: Scene, model: PainetPotential, known: Chemistry) -> tuple[Deviation, ...]:
-    """Return the deviation of a molecule that MD on a potential does not keep whole, or on whose forces its members
-    disagree in that MD."""
-    molecule, seeds = model.featurise(scene), range(_ASKED_COPIES)
+def disagreement(scene: Scene, model: PainetPotential) -> tuple[float, int]:
+    """Return by how much a potential's members differ on forces in short MD of a molecule (`PainetPotential.spread`,
+    kJ/mol/nm, the median of its replicas), and how many of sixteen replicas do not stay this molecule."""
+    molecule = model.featurise(scene)
     x = torch.tensor(scene.positions_nm, dtype=torch.float32).expand(_ASKED_COPIES, 1, -1, -1)
-    generators = [torch.Generator().manual_seed(seed) for seed in seeds]
+    generators = [torch.Generator().manual_seed(seed) for seed in range(_ASKED_COPIES)]
     v = None
     for _ in range(_ASKED_CHUNKS):
         chunk = model.next_chunk(x, molecule, draw_noise(model, scene.n_atoms, generators), last_velocities_nm_ps=v)
         x, v = chunk.frames_nm[:, -1:], chunk.velocities_nm_ps
-    if n_lost := int((check_frames(x[:, 0].numpy(), geometry_from_scene(scene)) & INVALID > 0).sum()):
-        reason = f"{n_lost} of {len(x)} replicas of MD on it do not stay this molecule"
-    elif (spread := float(model.spread(x[:, 0], molecule).median())) > known.spread_kj_mol_nm:
+    lost = check_frames(x[:, 0].numpy(), geometry_from_scene(scene)) & INVALID > 0
+    return float(model.spread(x[:, 0], molecule).median()), int(lost.sum())
+
+
+def _doubts(scene: Scene, model: PainetPotential, known: Chemistry) -> tuple[Deviation, ...]:
+    """Return the deviation of a molecule that MD on a potential does not keep whole, or on whose forces its members
+    disagree in that MD."""
+    spread, n_lost = disagreement(scene, model)
+    if n_lost:
+        reason = f"{n_lost} of {_ASKED_COPIES} replicas of MD on it do not stay this molecule"
+    elif spread > known.spread_kj_mol_nm:
         reason = (
             f"members' forces differ by {spread:.3g} kJ/mol/nm in MD on it; {known.spread_kj_mol_nm:.3g} is trusted"
         )

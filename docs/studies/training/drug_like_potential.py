@@ -2,11 +2,13 @@
 
     python docs/studies/training/drug_like_potential.py train FOLDER -o OUT.safetensors --budget 6h [--resume]
     python docs/studies/training/drug_like_potential.py errors OUT.safetensors FOLDER
+    python docs/studies/training/drug_like_potential.py trust OUT.safetensors FOLDER [--time 250ps]
 
 FOLDER is what drug_like_states.py labels. A step takes some molecules and some states of each. Energies count less
 their mean over a molecule's states, so that no baseline of atoms is needed; each member of the potential learns from
 three molecules in four, so that members disagree about chemistry that they have not seen. `errors` prints errors on
-the molecules that are held out, beside those that are trained on.
+the molecules that are held out, beside those that are trained on. `trust` rolls molecules that are neither, measures
+where the members' spread (`sampling.domain`) tells those that fly apart, and writes that limit into the weights.
 """
 
 from __future__ import annotations
@@ -14,32 +16,43 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 import torch
-from drug_like_states import read_list
-from safetensors.torch import load_file, save_file
+from drug_like_states import Entry, read_list
 from torch import Tensor
 
+import surrogate as sm
 from surrogate.models.painet.energy import NO_WALL_NM, PainetPotential, PotentialConfig, Topology
 from surrogate.models.propagator import Molecule
+from surrogate.models.weights import Chemistry, TrainingDomain, Weights, load_weights, provenance_of, save_weights
+from surrogate.sampling.domain import disagreement
 from surrogate.training.devices import torch_threads
 from surrogate.training.loop import Stage, StageConfig, train_stages
-from systems.units import parse_wall_s
+from systems.chemistry.validity import INVALID, geometry_from_scene
+from systems.errors import SimulationError, SurromdError
+from systems.library.named_scenes import prepare
+from systems.scene import ATOMIC_NUMBERS
+from systems.trajectory.codec import open_trajectory
+from systems.units import parse_time_ps, parse_wall_s
 
 # States so far above a molecule's lowest, for each atom, are left out: no MD comes there.
 HIGHEST_KJ_MOL = 12.0
 BAG, SEED = 0.75, 7
 KJ_MOL_NM_PER_KCAL_MOL_A, KJ_MOL_PER_KCAL = 41.84, 4.184
 VALIDATED = 40
+# Every so many-th molecule of the training list is kept for `trust`.
+ASIDE_EVERY, ASIDE = 42, "aside"
+REPLICAS, KEPT_WHOLE = 16, 0.96
 
 
 @dataclass(frozen=True, eq=False)
 class Labelled:
     """States of one molecule: `positions_nm` and `forces` (n, n_atoms, 3), `energies` (n,), in kJ/mol and nm."""
 
+    entry: Entry
     topology: Topology
     positions_nm: Tensor
     energies: Tensor
@@ -51,7 +64,8 @@ def load(folder: Path, splits: Sequence[str], most: int | None = None) -> list[L
     found = []
     for number, entry in enumerate(read_list()):
         path = folder / f"{number:04d}.npz"
-        if entry.split not in splits or not path.exists():
+        split = ASIDE if entry.split == "train" and number % ASIDE_EVERY == 0 else entry.split
+        if split not in splits or not path.exists():
             continue
         with np.load(path) as data:
             energies = data["energies_kj_mol"] - data["energies_kj_mol"].min()
@@ -61,7 +75,7 @@ def load(folder: Path, splits: Sequence[str], most: int | None = None) -> list[L
                                 charge=int(data["charges"].sum()))  # fmt: skip
             arrays = (data["positions_nm"][kept], energies[kept].astype(np.float32), data["forces_kj_mol_nm"][kept])
         if kept.sum() >= 8:
-            found.append(Labelled(Topology.of(molecule), *map(torch.from_numpy, arrays)))
+            found.append(Labelled(entry, Topology.of(molecule), *map(torch.from_numpy, arrays)))
         if most and len(found) >= most:
             break
     return found
@@ -150,7 +164,10 @@ def train(given: argparse.Namespace) -> None:
                         bf16=False, validate_every_s=given.validate)  # fmt: skip
 
     def write(spent_s: list[float]) -> None:
-        save_file({k: v.contiguous() for k, v in model.state_dict().items()}, given.out)
+        sources = [{"file": "docs/studies/training/drug_like.tsv", "n_frames": sum(len(s.energies) for s in learned)}]
+        found = {"seed": SEED, "training_s": round(sum(spent_s), 1), **learner.errors()}
+        provenance = provenance_of({"reference_ns": 0.0, "sources": sources}, found)
+        save_weights(given.out, model, domain_of(learned, config), provenance)
 
     def progress(name: str, share: float, metrics: dict[str, float]) -> None:
         if metrics:
@@ -161,10 +178,26 @@ def train(given: argparse.Namespace) -> None:
                      resume=given.resume, progress=progress)  # fmt: skip
 
 
+def domain_of(learned: list[Labelled], config: PotentialConfig) -> TrainingDomain:
+    """Return what the weights cover, with nothing trusted yet."""
+    scene = prepare(f"smiles:{learned[0].entry.smiles}")
+    conditions = {
+        "force_field": "gfn2-xtb", "solvent": "vacuum", "temperature_k": config.temperature_k,
+        "friction_per_ps": config.friction_per_ps, "timestep_ps": config.timestep_ps,
+        "hydrogen_mass_da": config.hydrogen_mass_da, "constrain_hydrogens": config.constrain_hydrogens,
+    }  # fmt: skip
+    numbers = torch.cat([one.topology.present for one in learned]).tolist()
+    elements = tuple(symbol for symbol, number in ATOMIC_NUMBERS.items() if number in numbers)
+    charges = [one.entry.charge for one in learned]
+    # Nothing is trusted until it is measured how far.
+    known = Chemistry(elements, max(one.entry.n_atoms for one in learned), (min(charges), max(charges)), 0.0)
+    geometry = geometry_from_scene(scene).to_dict()
+    return TrainingDomain(scene, config.lag_ps, conditions, geometry, transferable=True, chemistry=known)
+
+
 def print_errors(given: argparse.Namespace) -> None:
-    model = PainetPotential(PotentialConfig(width=given.width, n_steps=given.steps_of_network, n_members=4))
-    model.load_state_dict(load_file(given.weights))
-    model.eval()
+    model = load_weights(given.weights).model
+    assert isinstance(model, PainetPotential)
     for split in ("test", "train"):
         rows = np.array([errors_of(model, one, 80) for one in load(given.folder, [split], 60)])
         force, energy, spread = rows.T
@@ -172,6 +205,54 @@ def print_errors(given: argparse.Namespace) -> None:
         said(f"{split}: {len(rows)} molecules, force {force.mean():.3f} (median {np.median(force):.3f}, worst "
              f"{force.max():.2f}) kcal/mol/Å, energy {energy.mean():.4f} kcal/mol an atom; spread "
              f"{np.median(spread):.3f}, whose correlation with the error is {related:.2f}")  # fmt: skip
+
+
+def stays_whole(weights: Weights, smiles: str, time_ps: float, out: Path) -> float:
+    """Return the share of replicas whose frames are all valid after so long."""
+    try:
+        files = sm.rollout(f"smiles:{smiles}", weights.path, out, time_ps=time_ps, save_every_ps=1.0, guard="flag",
+                           replicas=REPLICAS, seed=SEED, force=True, quiet=True, overwrite=True)  # fmt: skip
+    except SimulationError:
+        return 0.0
+    whole = 0
+    for file in files:
+        with open_trajectory(file) as reader:
+            whole += not (reader.flags & INVALID).any()
+    return whole / len(files)
+
+
+def trust(given: argparse.Namespace) -> None:
+    """Roll molecules that are kept aside, and write the greatest spread below which so many of them stay whole."""
+    weights = load_weights(given.weights)
+    known, model = weights.domain.chemistry, weights.model
+    assert known is not None and isinstance(model, PainetPotential)
+    rows = []
+    for one in load(given.folder, [ASIDE]):
+        try:
+            spread, n_lost = disagreement(prepare(f"smiles:{one.entry.smiles}"), model)
+            whole = stays_whole(weights, one.entry.smiles, given.time, given.weights.with_suffix(".h5"))
+        except SurromdError as error:
+            said(f"{one.entry.smiles}: {error}")
+            continue
+        force, energy, _ = errors_of(model, one, 80)
+        with torch.no_grad():
+            members = model.members(one.positions_nm, one.topology)
+        unsure = float((members - members[:1]).std(-1, correction=0).mean())
+        if not n_lost:  # others are refused whatever the spread
+            rows.append((spread, whole, energy * KJ_MOL_PER_KCAL * one.entry.n_atoms, unsure))
+        said(f"{one.entry.smiles}: spread {spread:.3g} kJ/mol/nm, {100 * whole:.0f} % of replicas whole, force error "
+             f"{force:.2f} kcal/mol/Å")  # fmt: skip
+    if not rows:
+        raise SystemExit("none of the molecules kept aside stays whole for 2 ps; train longer.")
+    rows.sort()
+    lost = np.cumsum([whole < 1.0 for _, whole, *_ in rows])
+    enough = [k for k in range(len(rows)) if 1.0 - lost[k] / (k + 1) >= KEPT_WHOLE]
+    limit = rows[enough[-1]][0] if enough else 0.0
+    said(f"spread of at most {limit:.3g} kJ/mol/nm: {enough[-1] + 1 if enough else 0} of {len(rows)} molecules, "
+         f"{int(lost[enough[-1]]) if enough else 0} of these lose a replica")  # fmt: skip
+    domain = replace(weights.domain, chemistry=replace(known, spread_kj_mol_nm=limit))
+    energies = dict(zip(("energy_mae", "energy_spread"), np.median(rows, axis=0)[2:].tolist(), strict=True))
+    save_weights(given.weights, model, domain, {**weights.provenance, **energies})
 
 
 def said(line: str) -> None:
@@ -182,12 +263,14 @@ def said(line: str) -> None:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     verbs = parser.add_subparsers(dest="verb", required=True)
-    training, errors = verbs.add_parser("train"), verbs.add_parser("errors")
-    errors.add_argument("weights", type=Path)
-    for part in (training, errors):
+    training, errors, trusting = (verbs.add_parser(name) for name in ("train", "errors", "trust"))
+    for part in (errors, trusting):
+        part.add_argument("weights", type=Path)
+    for part in (training, errors, trusting):
         part.add_argument("folder", type=Path)
-        part.add_argument("--width", type=int, default=96)
-        part.add_argument("--steps-of-network", type=int, default=2)
+    trusting.add_argument("--time", type=lambda text: parse_time_ps(text, "--time"), default=250.0)
+    training.add_argument("--width", type=int, default=96)
+    training.add_argument("--steps-of-network", type=int, default=2)
     training.add_argument("-o", "--out", type=Path, required=True)
     training.add_argument("--budget", type=lambda text: parse_wall_s(text, "--budget"), required=True)
     training.add_argument("--resume", action="store_true")
@@ -197,7 +280,7 @@ def main() -> None:
     training.add_argument("--threads", type=int, default=1)
     training.add_argument("--validate", type=float, default=300.0)
     given = parser.parse_args()
-    train(given) if given.verb == "train" else print_errors(given)
+    {"train": train, "errors": print_errors, "trust": trust}[given.verb](given)
 
 
 if __name__ == "__main__":
