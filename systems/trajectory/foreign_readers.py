@@ -33,7 +33,6 @@ from systems.trajectory.foreign_scenes import (
     format_of,
     named_scene,
     scene_from_mdtraj_topology,
-    scene_from_structure,
     scene_from_universe,
 )
 from systems.trajectory.store import Float32Array, Float64Array
@@ -105,7 +104,7 @@ class MdtrajReader(_InMemory):
         super().__init__(path)
         self._format = format_of(path)
         self.notes = self._format.notes
-        stated = None if top is None else scene_from_structure(top, name=path.stem)
+        stated = self._scene_of(top)
         whole = self._load(None if stated is None or self._format.names_atoms else stated.to_mdtraj_topology())
         self._positions = np.asarray(whole.xyz, dtype=np.float32)
         cells = whole.unitcell_vectors
@@ -274,10 +273,8 @@ class MdanalysisReader(TrajectoryReader):
         self._format = format_of(path)
         self.notes = self._format.notes
         self._kept: IntArray | None = None
-        stated = None
-        if top is not None:
-            stated = scene_from_structure(top, name=path.stem)
-        elif self._format.names_atoms:
+        stated = self._scene_of(top)
+        if stated is None and self._format.names_atoms:
             stated = scene_from_universe(path, name=path.stem)
         try:
             with warnings.catch_warnings():
