@@ -8,6 +8,7 @@ Nothing is invented: what transitions do not connect in both directions gets no 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
@@ -23,14 +24,14 @@ from systems.errors import InputError
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
 
-_N_DRAWS = 50
+_N_DRAWS, _FLAT_DRAWS = 50, 20
 # Of the likelihood's fixed point: change of log populations in a step at its end, most steps, and longest jumps, in
 # steps and in log populations.
 _STEP_TOLERANCE, _MOST_STEPS, _FURTHEST, _LONGEST_JUMP = 1e-9, 5_000, 1e6, 20.0
 _LAGS = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000, 5000)
 # A lag leaves each replica four pairs that do not overlap.
 _LAGS_A_REPLICA = 4
-# Timescales are flat where a lag some twice as long changes the slowest by no more than this or two standard errors.
+# Timescales are flat where no longer lag adds more than this, or two standard errors, to the logarithm of the slowest.
 _FLAT = 0.15
 _CK_MULTIPLES = (2, 3)
 _CK_TOLERANCE = 0.05
@@ -310,22 +311,30 @@ def _draw(model: _Model, resampled: IntArray) -> tuple[FloatArray, FloatArray]:
 
 
 def _choose(models: list[_Model], resampled: IntArray) -> tuple[int, bool]:
-    """Return which lag to take, the shortest from which on the slowest timescale is flat, and whether one is."""
+    """Return which lag to take, the shortest from which on the slowest timescale is flat, and whether one is.
+
+    What a longer lag adds is compared with its own error, of the same resampled replicas at both: chance makes a
+    timescale long or short at all lags together. Too short a lag makes timescales short, never long (Prinz et al.).
+    """
     if len(models) == 1:
         return 0, True
-    slowest = [float(m.times[0]) if len(m.times) else 0.0 for m in models]
-    errors = []
-    for model in models:
-        times = _draw(model, resampled[:10])[1]
-        errors.append(float(np.nanstd(times[:, 0])) if times.size else 0.0)
-    for k in range(len(models) - 1):
-        off = [abs(slowest[j] - slowest[k]) for j in range(k + 1, min(k + 3, len(models)))]
-        room = [max(_FLAT * slowest[k], 2.0 * errors[j]) for j in range(k + 1, min(k + 3, len(models)))]
+    slowest = [_log_slowest(m.times[None]) for m in models]
+    drawn = [_log_slowest(_draw(m, resampled[:_FLAT_DRAWS])[1]) for m in models]
+    for k, model in enumerate(models[:-1]):
         # A process as fast as the lag cannot be followed any longer.
-        fast = slowest[k] < models[k].lag
-        if fast or all(o <= r for o, r in zip(off, room, strict=True)):
+        if not slowest[k][0] >= math.log(model.lag):
+            return k, True
+        added = [float(later[0] - slowest[k][0]) for later in slowest[k + 1 :]]
+        errors = [float(np.nanstd(later - drawn[k])) for later in drawn[k + 1 :]]
+        if all(a <= max(_FLAT, 2.0 * e) for a, e in zip(added, errors, strict=True)):
             return k, True
     return len(models) - 1, False
+
+
+def _log_slowest(times: FloatArray) -> FloatArray:
+    """Return the logarithms of the first of `times` (n, k), -infinity where there is none."""
+    with np.errstate(divide="ignore"):
+        return np.log(times[:, 0]) if times.shape[1] else np.full(len(times), -np.inf)
 
 
 def _chapman_kolmogorov(

@@ -72,6 +72,22 @@ def test_timescales_are_those_of_the_chain() -> None:
     assert abs(found.timescales[0] - exact) < 3.0 * found.timescale_errors[0]
 
 
+def test_blurred_states_take_a_lag_at_which_their_process_is_as_slow_as_it_is() -> None:
+    """Frames near a barrier are put on either side, which looks like jumps at short lags. Few transitions make wide
+    errors, and yet lags do not agree: chance at one of them is chance at all."""
+    rng, slowest, inside = np.random.default_rng(3), [], []
+    slow = np.array([[0.9995, 0.0005], [0.0005, 0.9995]])  # takes 1000 frames
+    for seed in range(6):
+        hidden = run(slow, [0] * 10 + [1] * 6, 1000, seed)
+        blurred = [np.where(rng.random(len(m)) < 0.002, 1 - m, m) for m in hidden]
+        found, short = equilibrium(blurred, seed=seed), equilibrium(blurred, lag=5)
+        slowest.append((found.timescales[0], short.timescales[0]))
+        inside.append(abs(found.populations[0] - 0.5) < 2.0 * found.draws[:, 0].std())
+    long, control = np.median(slowest, axis=0)
+    assert 600.0 < long < 1700.0 and control < 450.0
+    assert np.mean(inside) >= 0.5
+
+
 def test_replicas_that_outlast_the_slowest_process_are_averaged() -> None:
     micro = run(chain(rate=0.2), [2] * 16, 4000)
     found = equilibrium(micro)
