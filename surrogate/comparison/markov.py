@@ -67,7 +67,8 @@ class Equilibrium:
     errors; `crossings`: how often the slowest process was seen, in the rarer direction. `populations` `(n_micro,)`, 0
     outside the connected set; `draws` `(n_draws, n_micro)` of a bootstrap over replicas, whose multiplicities are
     `resampled` `(n_draws, n_units)`; `unit_of` says for each unit which replica and which frames it is. `weights`: of
-    every frame, one array a replica, mean 1 over all. `unconnected`: what has no weight.
+    every frame, one array a replica, mean 1 over all. `unconnected`: what has no weight. `n_own`: how many replicas are
+    MD; those behind are images of them.
     """
 
     method: Literal["Markov model", "plain averages"]
@@ -84,6 +85,7 @@ class Equilibrium:
     unit_of: tuple[tuple[int, int, int], ...]
     weights: tuple[FloatArray, ...]
     unconnected: tuple[Unconnected, ...]
+    n_own: int
 
     @property
     def holds(self) -> bool:
@@ -116,13 +118,17 @@ def _spread(populations: FloatArray, counts: FloatArray) -> FloatArray:
     return np.asarray(found / norm if norm > 0 else found)
 
 
-def equilibrium(micro: Sequence[IntArray], *, lag: int | None = None, seed: int = 0) -> Equilibrium:
+def equilibrium(
+    micro: Sequence[IntArray], *, lag: int | None = None, n_own: int | None = None, seed: int = 0
+) -> Equilibrium:
     """Return the equilibrium of MD replicas whose frames were put into microstates.
 
     `micro`: one array `(n_frames,)` a replica of microstates from 0, -1 for none, frames equally far apart; `lag`: in
-    frames, None for the shortest at which the slowest timescale is flat. Where every replica is twenty times as long as
-    the slowest process, plain averages. Raises InputError where there is nothing to count.
+    frames, None for the shortest at which the slowest timescale is flat; `n_own`: how many of them are MD, the others
+    images of these that are as likely: they count, and are drawn with them. Where every replica is twenty times as long
+    as the slowest process, plain averages. Raises InputError where there is nothing to count.
     """
+    own = sum(len(m) > 1 for m in micro[:n_own])
     micro = [np.asarray(m, dtype=np.int64) for m in micro if len(m) > 1]
     if not micro or max(m.max() for m in micro) < 0:
         raise InputError("there are no frames in any state, and so no equilibrium to tell; give longer replicas.")
@@ -130,8 +136,10 @@ def equilibrium(micro: Sequence[IntArray], *, lag: int | None = None, seed: int 
     rng = np.random.default_rng(seed)
     longest = max(1, int(np.median([len(m) for m in micro])) // _LAGS_A_REPLICA)
     lags = [n for n in _LAGS if n <= longest] if lag is None else [lag]
-    units = _units(micro, lags[-1])
-    resampled = rng.multinomial(len(units), np.full(len(units), 1.0 / len(units)), size=_N_DRAWS)
+    images = len(micro) // own
+    units = _units(micro, lags[-1], -(-_LEAST_UNITS // own))
+    n_units = len(units) // images
+    resampled = np.tile(rng.multinomial(n_units, np.full(n_units, 1.0 / n_units), size=_N_DRAWS), images)
     models = [_Model(micro, units, n_micro, n) for n in lags]
     chosen, flat = _choose(models, resampled)
     model = models[chosen]
@@ -143,22 +151,24 @@ def equilibrium(micro: Sequence[IntArray], *, lag: int | None = None, seed: int 
     lost = any(u.fate != "left and never entered" for u in unconnected)
     ck_error, ck_holds = _chapman_kolmogorov(model, micro, units, resampled[:20])
     found = Equilibrium(
-        "Markov model", model.lag, model.times, errors, flat, ck_error, ck_holds, model.crossings(micro),
-        model.populations, draws, resampled, tuple(units), (), unconnected,
+        "Markov model", model.lag, model.times, errors, flat, ck_error, ck_holds, model.crossings(micro[:own]),
+        model.populations, draws, resampled, tuple(units), (), unconnected, own,
     )  # fmt: skip
     if n_frames.min() >= _OUTLASTS * slowest and not lost and found.crossings > 0:
         return _averaged(found, micro, round(_LEFT_OUT * slowest))
-    visits = np.zeros(n_micro)
-    for m in micro:
-        visits += np.bincount(m[m >= 0], minlength=n_micro)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        each = np.where(visits > 0, model.populations / visits, 0.0)
-    return _with_weights(found, [np.append(each, 0.0)[m] for m in micro])
+    weights: list[FloatArray] = []
+    for k in range(0, len(micro), own):  # what is MD has the populations by itself
+        visits = sum(np.bincount(m[m >= 0], minlength=n_micro) for m in micro[k : k + own])
+        with np.errstate(divide="ignore", invalid="ignore"):
+            each = np.where(visits > 0, model.populations / visits, 0.0)
+        weights += [np.append(each, 0.0)[m] for m in micro[k : k + own]]
+    return replace(found, weights=with_mean_one(weights))
 
 
-def _with_weights(found: Equilibrium, weights: list[FloatArray]) -> Equilibrium:
+def with_mean_one(weights: Sequence[FloatArray]) -> tuple[FloatArray, ...]:
+    """Return weights of frames, an array a replica, so that their mean is one."""
     mean = sum(w.sum() for w in weights) / sum(map(len, weights))
-    return replace(found, weights=tuple(w / mean for w in weights))
+    return tuple(w / mean for w in weights)
 
 
 def _averaged(found: Equilibrium, micro: list[IntArray], left_out: int) -> Equilibrium:
@@ -172,12 +182,11 @@ def _averaged(found: Equilibrium, micro: list[IntArray], left_out: int) -> Equil
     draws /= np.maximum(draws.sum(1, keepdims=True), 1.0)
     total = counts.sum(0)
     averaged = replace(found, method="plain averages", populations=total / total.sum(), draws=draws)
-    return _with_weights(averaged, weights)
+    return replace(averaged, weights=with_mean_one(weights))
 
 
-def _units(micro: list[IntArray], lag: int) -> list[tuple[int, int, int]]:
-    """Return what a bootstrap draws from: replicas, or pieces of them where they are few."""
-    pieces = -(-_LEAST_UNITS // len(micro))
+def _units(micro: list[IntArray], lag: int, pieces: int) -> list[tuple[int, int, int]]:
+    """Return what a bootstrap draws from: replicas, or up to so many pieces of each where they are few."""
     units = []
     for k, m in enumerate(micro):
         n = max(1, min(pieces, len(m) // (2 * lag)))

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from surrogate.comparison.markov import Equilibrium, equilibrium
+from surrogate.comparison.markov import Equilibrium, equilibrium, with_mean_one
 from surrogate.comparison.measure import kinetics
 from surrogate.comparison.measure.distributions import is_alpha
 from surrogate.comparison.measure.slow_motion import SLOW_KINDS
@@ -23,6 +23,7 @@ from surrogate.comparison.measure.torsions import Torsion, find_torsions, find_w
 from surrogate.comparison.read.ensemble import Ensemble
 from systems.chemistry.validity import INVALID
 from systems.errors import InputError
+from systems.scene import Scene, neighbours_of
 from systems.units import GAS_CONSTANT_KJ_MOL_K, format_time_ps
 
 FloatArray = npt.NDArray[np.float64]
@@ -199,6 +200,8 @@ class _Torsions:
         self.quads = np.concatenate([np.asarray(r, dtype=np.int64).reshape(-1, 4) for r in rows])
         self.fold = np.array([1] * (len(rows[0]) + len(rows[1])) + [t.fold for t in self.others])
         self.n_phi, self.n_psi = len(rows[0]), len(rows[1])
+        # Of peptides tables of φ and ψ may say otherwise.
+        self.has_images = not self.backbone.residues and _is_its_mirror_image(scene)
 
     def of(self, ensemble: Ensemble) -> list[FloatArray]:
         """Return angles `(n_frames, k)` rad per segment, times their fold; NaN where a frame is not finite."""
@@ -219,18 +222,32 @@ class _Torsions:
         return out
 
 
+def _is_its_mirror_image(scene: Scene) -> bool:
+    """Return whether MD of a molecule reaches the mirror images of its frames, atom by atom: nothing keeps handedness,
+    not even atoms with like neighbours, such as isopropyl's."""
+    heavy = [[k for k in near if scene.elements[k] != "H"] for near in neighbours_of(scene.bonds, scene.n_atoms)]
+    degree = np.bincount(scene.bonds.ravel(), minlength=scene.n_atoms)
+    # Amines turn inside out; sulfoxides and phosphines do not.
+    keeps = 3 + np.isin(scene.elements, ["C", "N", "O"])
+    return not any(len(near) >= 3 and degree[k] >= keeps[k] for k, near in enumerate(heavy))
+
+
 def md_answer(md: Ensemble, temperature_k: float, *, surrogate: Ensemble | None = None, seed: int = 0) -> Answer:
     """Return what MD replicas say of equilibrium, and how a surrogate's populations compare with that.
 
-    `md`: one segment a replica; `temperature_k` of its bath. Raises InputError where no torsion of the molecule turns
-    or replicas are too short to tell anything.
+    `md`: one segment a replica; `temperature_k` of its bath. Of a small molecule that is its own mirror image each
+    replica counts with its mirror image, as long as MD connects the two. Raises InputError where no torsion of the
+    molecule turns or replicas are too short to tell anything.
     """
     torsions = _Torsions(md)
     if not len(torsions.quads):
         raise InputError(f"{md.scene.name}: no torsion turns, and so there are no states to weigh.")
-    angles = torsions.of(md)
-    micro = _microstates(angles, md.lag_ps)
-    found = equilibrium(micro, seed=seed)
+    of_md = torsions.of(md)
+    for angles in ([*of_md, *(-a for a in of_md)], of_md) if torsions.has_images else (of_md,):
+        micro = _microstates(angles, md.lag_ps)
+        found = equilibrium(micro, n_own=len(of_md), seed=seed)
+        if not found.unconnected:
+            break
     own = torsions.of(surrogate) if surrogate is not None else None
     states: list[StateEnergy] = []
     missing: list[str] = []
@@ -250,18 +267,18 @@ def md_answer(md: Ensemble, temperature_k: float, *, surrogate: Ensemble | None 
     ps = md.lag_ps
     return Answer(
         method=found.method,
-        n_replicas=len(micro),
+        n_replicas=found.n_own,
         replica_ps=float(np.median([len(m) for m in micro])) * ps,
         lag_ps=ps,
         model_lag_ps=found.lag_frames * ps,
         timescales_ps=tuple((found.timescales * ps).tolist()),
         timescale_errors_ps=tuple((found.timescale_errors * ps).tolist()),
-        tests=_tests(found, ps),
+        tests=_tests(found, ps) + ", each replica with its mirror image" * (found.n_own < len(micro)),
         holds=found.holds,
         states=tuple(states),
         maps=_maps(torsions, angles, found.weights, temperature_k),
         missing=tuple(dict.fromkeys(missing)),
-        weights=found.weights,
+        weights=with_mean_one(found.weights[: found.n_own]),
     )
 
 
@@ -337,7 +354,8 @@ def _energies(
     kt = GAS_CONSTANT_KJ_MOL_K * temperature_k
     best = int(np.argmax(shares))
     n_frames = sum(map(len, labels))
-    visits = [np.bincount(x[x >= 0], minlength=n) for x in labels]
+    # Each replica with its images.
+    replicas = [labels[k :: found.n_own] for k in range(found.n_own)]
     own, own_error = (None, None) if rolled is None else _own_shares(rolled, n)
     out = []
     for s, name in enumerate(names):
@@ -347,13 +365,13 @@ def _energies(
             energies = -kt * np.log(drawn[:, s] / drawn[:, best]) if len(drawn) else np.zeros(0)
             energy = float(-kt * math.log(shares[s] / shares[best]))
             error = float(np.std(energies, ddof=1)) if len(energies) > 1 else None
-        there = sum(bool(v[s]) for v in visits)
+        there = sum(any(bool((x == s).any()) for x in images) for images in replicas)
         rolled_share = None if own is None else float(own[s])
         if there == 0 and not rolled_share:
             continue
         out.append(StateEnergy(
             torsion, name, float(shares[s]), max(float(draws[:, s].std()), 1.0 / n_frames), energy, error, there,
-            sum(bool(len(x)) and bool(x[0] == s) for x in labels), rolled_share,
+            sum(any(bool(x[0] == s) for x in images if len(x)) for images in replicas), rolled_share,
             None if own_error is None else float(own_error[s]),
             "" if shares[s] > 0 or _left(found, micro, labels, s) else "no weight is known",
         ))  # fmt: skip

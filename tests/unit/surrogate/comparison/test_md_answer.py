@@ -8,12 +8,14 @@ import math
 import numpy as np
 import pytest
 
+from surrogate.comparison import md_answer as told
 from surrogate.comparison.markov import equilibrium
-from surrogate.comparison.md_answer import frames_over_states, md_answer
+from surrogate.comparison.md_answer import Answer, frames_over_states, md_answer
 from surrogate.comparison.measure.torsions import find_torsions
 from surrogate.comparison.read.ensemble import Ensemble
 from systems.chemistry.graph import backbone_torsions, bonded_graph, turned
 from systems.errors import InputError
+from systems.library.named_scenes import prepare
 from systems.prepare.peptide import build_peptide
 
 SCENE = build_peptide("ACE-ALA-NME")
@@ -127,34 +129,88 @@ def test_weights_make_plain_histograms_right(forms: np.ndarray) -> None:
     assert grid.shape == (36, 36) and grid.min() == 0.0
 
 
-def test_wells_of_a_further_torsion_are_states_with_their_shares() -> None:
-    """Butane's torsion: anti and both gauche, of known shares, named by their mean angles; one well is no state."""
-    from systems.library.named_scenes import prepare
+# Butane's anti, gauche+ and gauche-, of populations 5/8 and twice 3/16.
+GAUCHE = np.array([[0.94, 0.03, 0.03], [0.1, 0.9, 0.0], [0.1, 0.0, 0.9]])
 
+
+def butane(centres: tuple[float, ...], states: np.ndarray) -> Ensemble:
+    """Butane whose torsion is about the centre, in degrees, of each state."""
     scene = prepare("smiles:CCCC")
     graph, rng = bonded_graph(scene), np.random.default_rng(0)
     (quad,) = (t.quad for t in find_torsions(scene) if t.kind == "rotatable")
-    states = jumps(np.array([[0.94, 0.03, 0.03], [0.1, 0.9, 0.0], [0.1, 0.0, 0.9]]), [0, 1, 2, 0] * 4, 300, 8)
+    forms = np.array([[turned(scene.positions_nm, list(quad), math.radians(c + rng.normal(0, 12.0))
+                              - _angle(scene.positions_nm, np.array(quad)), graph) for _ in range(FORMS)]
+                      for c in centres], dtype=np.float32)  # fmt: skip
+    return Ensemble("MD", [forms[row, rng.integers(FORMS, size=len(row))] for row in states], 1.0, scene)
 
-    def run(centres: tuple[float, ...]) -> Ensemble:
-        forms = np.array([[turned(scene.positions_nm, list(quad), math.radians(c + rng.normal(0, 12.0))
-                                  - _angle(scene.positions_nm, np.array(quad)), graph) for _ in range(FORMS)]
-                          for c in centres], dtype=np.float32)  # fmt: skip
-        return Ensemble("MD", [forms[row, rng.integers(FORMS, size=len(row))] for row in states], 1.0, scene)
 
-    answer = md_answer(run((180.0, 65.0, -65.0)), 300.0)
+def test_wells_of_a_further_torsion_are_states_with_their_shares() -> None:
+    """Butane's torsion: anti and both gauche, of known shares, named by their mean angles; one well is no state."""
+    states = jumps(GAUCHE, [0, 1, 2, 0] * 4, 300, 8)
+    answer = md_answer(butane((180.0, 65.0, -65.0), states), 300.0)
     found = {s.state: s for s in answer.states}
     named = {int(name.removesuffix("°")): s for name, s in found.items()}
     assert len(found) == 3 and all(min(abs(abs(k) - c) for c in (180, 65)) < 8 for k in named)
     for k, state in named.items():
         right = 0.625 if abs(k) > 120 else 0.1875
         assert abs(state.share - right) < 3.0 * state.error + 0.03, (k, state)
-    assert not md_answer(run((180.0, 180.0, 180.0)), 300.0).states, "negative control"
+    assert not md_answer(butane((180.0, 180.0, 180.0), states), 300.0).states, "negative control"
+
+
+def test_a_molecule_that_is_its_own_mirror_image_has_either_hand_alike(monkeypatch: pytest.MonkeyPatch) -> None:
+    # All begin on one side, and few get to the other.
+    states = jumps(GAUCHE, [1] * 12, 40, 3)
+    md = butane((180.0, 65.0, -65.0), states)
+
+    def hands(answer: Answer) -> tuple[float, float]:
+        found = {int(s.state.removesuffix("°")): s.share for s in answer.states}
+        return next(s for k, s in found.items() if 0 < k < 120), next(s for k, s in found.items() if -120 < k < 0)
+
+    answer = md_answer(md, 300.0)
+    plus, minus = hands(answer)
+    assert plus == pytest.approx(minus, abs=0.01) and "mirror image" in answer.tests
+    for s in answer.states:
+        right = 0.1875 if abs(int(s.state.removesuffix("°"))) < 120 else 0.625
+        assert abs(s.share - right) < 3.0 * s.error
+    assert answer.n_replicas == len(answer.weights) == 12 and all(s.n_replicas <= 12 for s in answer.states)
+    assert np.mean(np.concatenate(answer.weights)) == pytest.approx(1.0)
+    # Frames of MD have these shares by their weights, whichever side they are on.
+    side = np.average(states.ravel() == 1, weights=np.concatenate(answer.weights))
+    assert side == pytest.approx(plus, abs=0.02) and (states == 1).mean() > 0.3
+    # Twice as many replicas would have less of an error: each is drawn with its image.
+    anti = next(s for s in answer.states if abs(int(s.state[:-1])) > 120)
+    twice = md_answer(butane((180.0, 65.0, -65.0), np.concatenate([states, jumps(GAUCHE, [1] * 12, 40, 9)])), 300.0)
+    assert anti.error > next(s for s in twice.states if abs(int(s.state[:-1])) > 120).error
+    monkeypatch.setattr(told, "_is_its_mirror_image", lambda scene: False)
+    plus, minus = hands(control := md_answer(md, 300.0))
+    assert abs(plus - minus) > 0.1 and "mirror image" not in control.tests, "negative control"
+
+
+def test_a_hand_that_md_never_changes_is_not_the_other() -> None:
+    """An axis that does not turn: its mirror image is another molecule, whatever its atoms say."""
+    states = jumps(np.array([[0.9, 0.1], [0.1, 0.9]]), [0, 1] * 6, 60, 3)
+    answer = md_answer(butane((60.0, 120.0), states), 300.0)
+    assert "mirror image" not in answer.tests and not answer.missing
+    assert sorted(int(s.state[:-1]) > 0 for s in answer.states) == [True, True]
+
+
+@pytest.mark.parametrize(
+    ("smiles", "is_own_image"),
+    [
+        ("CCN(CC)CC(=O)Nc1c(C)cccc1C", True),  # its amine turns inside out
+        ("C1CCCCC1", True),
+        ("CC(C)CC", False),  # isopropyl's methyls have names
+        ("CC[NH+](CC)CC", False),
+        ("CS(=O)C", False),
+        ("CCS(=O)(=O)CC", False),
+        ("C[C@H](O)CC", False),
+    ],
+)
+def test_what_keeps_its_hand_atom_by_atom(smiles: str, is_own_image: bool) -> None:
+    assert told._is_its_mirror_image(prepare(f"smiles:{smiles}")) is is_own_image
 
 
 def test_a_molecule_without_torsions_is_one_line() -> None:
-    from systems.library.named_scenes import prepare
-
     water = prepare("smiles:C")
     with pytest.raises(InputError, match="no torsion turns"):
         md_answer(Ensemble("MD", [np.repeat(water.positions_nm[None], 20, 0).astype(np.float32)], 1.0, water), 300.0)
