@@ -3,12 +3,14 @@
     python docs/studies/training/drug_like_potential.py train FOLDER -o OUT.safetensors --budget 6h [--resume]
     python docs/studies/training/drug_like_potential.py errors OUT.safetensors FOLDER
     python docs/studies/training/drug_like_potential.py trust OUT.safetensors FOLDER [--time 250ps]
+    python docs/studies/training/drug_like_potential.py tune OUT.safetensors FOLDER [--seconds 60 180] [--molecules 10]
 
 FOLDER is what drug_like_states.py labels. A step takes some molecules and some states of each. Energies count less
 their mean over a molecule's states, so that no baseline of atoms is needed; each member of the potential learns from
 three molecules in four, so that members disagree about chemistry that they have not seen. `errors` prints errors on
 the molecules that are held out, beside those that are trained on. `trust` rolls molecules that are neither, measures
-where the members' spread (`sampling.domain`) tells those that fly apart, and writes that limit into the weights.
+where the members' spread (`sampling.domain`) tells those that fly apart, and writes that limit into the weights. `tune`
+trains on held-out molecules one by one, beginning with the weights and with nothing, as `surromd train` does.
 """
 
 from __future__ import annotations
@@ -255,6 +257,24 @@ def trust(given: argparse.Namespace) -> None:
     save_weights(given.weights, model, domain, {**weights.provenance, **energies})
 
 
+def tune(given: argparse.Namespace) -> None:
+    """Print errors of forces after so much training on one molecule, from the weights and from nothing."""
+    for one in load(given.folder, ["test"], given.molecules):
+        found = []
+        for seconds in given.seconds:
+            for start in (given.weights, None):
+                out = given.weights.with_name("tuned.safetensors")
+                sm.train(f"smiles:{one.entry.smiles}", out, level="gfn2-xtb", start_from=start, budget_s=seconds,
+                         seed=SEED, quiet=True, overwrite=True)  # fmt: skip
+                model = load_weights(out).model
+                assert isinstance(model, PainetPotential)
+                force = errors_of(model, one, 80)[0]
+                found.append(f"{seconds:g} s from {'nothing' if start is None else 'these'} {force:.2f}")
+        model = load_weights(given.weights).model
+        assert isinstance(model, PainetPotential)
+        said(f"{one.entry.smiles}: untuned {errors_of(model, one, 80)[0]:.2f}, {', '.join(found)} kcal/mol/Å")
+
+
 def said(line: str) -> None:
     sys.stdout.write(line + "\n")
     sys.stdout.flush()
@@ -263,11 +283,13 @@ def said(line: str) -> None:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     verbs = parser.add_subparsers(dest="verb", required=True)
-    training, errors, trusting = (verbs.add_parser(name) for name in ("train", "errors", "trust"))
-    for part in (errors, trusting):
+    training, errors, trusting, tuning = (verbs.add_parser(name) for name in ("train", "errors", "trust", "tune"))
+    for part in (errors, trusting, tuning):
         part.add_argument("weights", type=Path)
-    for part in (training, errors, trusting):
+    for part in (training, errors, trusting, tuning):
         part.add_argument("folder", type=Path)
+    tuning.add_argument("--seconds", type=float, nargs="+", default=[60.0, 180.0])
+    tuning.add_argument("--molecules", type=int, default=10)
     trusting.add_argument("--time", type=lambda text: parse_time_ps(text, "--time"), default=250.0)
     training.add_argument("--width", type=int, default=96)
     training.add_argument("--steps-of-network", type=int, default=2)
@@ -280,7 +302,7 @@ def main() -> None:
     training.add_argument("--threads", type=int, default=1)
     training.add_argument("--validate", type=float, default=300.0)
     given = parser.parse_args()
-    {"train": train, "errors": print_errors, "trust": trust}[given.verb](given)
+    {"train": train, "errors": print_errors, "trust": trust, "tune": tune}[given.verb](given)
 
 
 if __name__ == "__main__":
