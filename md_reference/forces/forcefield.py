@@ -86,11 +86,12 @@ def _choose(scene: Scene) -> str:
     return "gaff2"
 
 
-def build_system(scene: Scene, spec: ForceFieldSpec) -> Any:
+def build_system(scene: Scene, spec: ForceFieldSpec, *, rough: bool = False) -> Any:
     """Return the `openmm.System` of a scene: without a cell no cut-off, in one PME; no centre-of-mass removal.
 
     Particles are the scene's atoms in its order; virtual sites (OPC) come after them. The OBC2 term is OpenMM's
-    GBSAOBCForce, several times faster than the CustomGBForce of implicit/obc2.xml, with the same energies. Raises
+    GBSAOBCForce, several times faster than the CustomGBForce of implicit/obc2.xml, with the same energies. `rough`: see
+    `gaff.entry`. Raises
     PreparationError when the force field has no parameters for a residue or a molecule, or does not suit the scene's
     cell.
     """
@@ -104,7 +105,7 @@ def build_system(scene: Scene, spec: ForceFieldSpec) -> Any:
     if spec.force_field in PROTEIN_FORCE_FIELDS:
         system = build_templated(scene, spec)
     else:
-        system = _build_mixed(scene, spec)
+        system = _build_mixed(scene, spec, rough=rough)
     if scene.cell_nm is not None:
         system.setDefaultPeriodicBoxVectors(*(row.tolist() for row in scene.cell_nm))
     return system
@@ -131,7 +132,7 @@ def _check_cell(scene: Scene, spec: ForceFieldSpec) -> None:
             )
 
 
-def _build_mixed(scene: Scene, spec: ForceFieldSpec) -> Any:
+def _build_mixed(scene: Scene, spec: ForceFieldSpec, *, rough: bool) -> Any:
     """GAFF2 molecules and chains with residues from GAFF2, alone or beside peptides, water and ions."""
     from openmm import NonbondedForce, app
 
@@ -159,7 +160,9 @@ def _build_mixed(scene: Scene, spec: ForceFieldSpec) -> Any:
                 "residues are joined to ff14SB alone: use `force_field='ff14SB+gaff2'`."
             )
         vacuum = {"nonbondedMethod": app.NoCutoff, "rigidWater": False, **spec.openmm_settings()}
-        parts.append((atoms, build_chain(chain, spec) if chain else gaff.entry(part).system(part, **vacuum)))
+        parts.append(
+            (atoms, build_chain(chain, spec) if chain else gaff.entry(part, rough=rough).system(part, **vacuum))
+        )
     system = merge(scene.n_atoms, parts)
     if spec.is_explicit:
         nonbonded = next(f for f in system.getForces() if isinstance(f, NonbondedForce))

@@ -65,10 +65,11 @@ class Entry:
         return permuted(system, match_atoms(scene, self.scene))
 
 
-def entry(scene: Scene, *, cached: bool = True) -> Entry:
+def entry(scene: Scene, *, cached: bool = True, rough: bool = False) -> Entry:
     """Return the GAFF2 parameters and AM1-BCC charges of a molecule: shipped ones, else those cached by `molecule_key`
     and program versions, else made by AmberTools from the scene's bonds, charge and positions (`cached=False`: at once,
-    and nothing is kept).
+    and nothing is kept); `rough`: where none are shipped, with Gasteiger's charges, which need no quantum mechanics;
+    nothing is kept. For hot MD whose states a better method labels.
 
     Stereo plays no part in GAFF2. What rounding leaves of the total charge is spread evenly. Raises PreparationError
     with the reason for what GAFF2 or AM1-BCC cannot describe, and where AmberTools is needed and absent.
@@ -79,10 +80,12 @@ def entry(scene: Scene, *, cached: bool = True) -> Entry:
     tools, folder, stem = find_ambertools(), cache_folder() / "parameters", f"{molecule_key(scene)}-{METHOD}"
     # Without AmberTools what any version made, the last by name.
     kept = [folder / f"{stem}-{tools.label}.json.gz"] if tools else sorted(folder.glob(f"{stem}-*.json.gz"))[-1:]
-    for path in (shipped_path(scene), *kept):
+    for path in (shipped_path(scene), *([] if rough else kept)):
         found = read_entry(path)
         if found is not None and _fits(found, scene):
             return found
+    if rough:
+        return _parametrise(scene, "gas")
     made = _parametrise(scene)
     with suppress(StorageError):  # a cache that cannot be written costs time, not the run
         made = store(kept[0], made)
@@ -174,13 +177,6 @@ def refuse(scene: Scene) -> None:
             f"charges for them take about {format_wall(expected_s(scene.n_atoms))}, and more than {LARGEST} are not "
             "computed. Give a smaller molecule, or one of standard residues."
         )
-
-
-def rough_parameters(scene: Scene) -> str:
-    """Return GAFF2 with Gasteiger's charges, which need no quantum mechanics, as AMBER prmtop text that is not cached:
-    for hot MD whose states a better method labels. Raises PreparationError as `entry`."""
-    refuse(scene)
-    return _parametrise(scene, "gas").prmtop
 
 
 def _parametrise(scene: Scene, charges: str = "bcc") -> Entry:

@@ -107,8 +107,9 @@ class Labeller(Closing):
         )
 
     def explore(self, n_states: int, temperatures_k: Sequence[float], *, seed: int) -> FloatArray:
-        """Return states `(n, n_atoms, 3)` nm of hot MD by GAFF2, or by GFN2-xTB where GAFF2 has no parameters and of
-        water, which is rigid beside it; as many at each temperature, of every third one torsion turned."""
+        """Return states `(n, n_atoms, 3)` nm of hot MD by GAFF2 (`rough`, see `gaff.entry`), or by GFN2-xTB where GAFF2
+        has no parameters and of water, which is rigid beside it; as many at each temperature, of every third one
+        torsion turned."""
         rng = np.random.default_rng(seed)
         each, apart_ps = -(-n_states // len(temperatures_k)), self._cheap[2].apart_ps
         states = np.concatenate([self._md(each, apart_ps, t, seed=int(rng.integers(2**31))) for t in temperatures_k])
@@ -130,7 +131,7 @@ class Labeller(Closing):
         spec, system, pace = self._cheap
         if constrain_hydrogens:
             spec = replace(spec, constrain_hydrogens=True)
-            system = build_system(self.scene, spec)
+            system = build_system(self.scene, spec, rough=True)
         conditions = Conditions(force=spec, temperature_k=temperature_k, timestep_ps=pace.timestep_ps, seed=seed,
                                 platform="Reference")  # fmt: skip
         frames = np.empty((n_frames, self.scene.n_atoms, 3))
@@ -153,7 +154,7 @@ class Labeller(Closing):
         for name, pace in paces.items():
             spec = ForceFieldSpec(name, "vacuum", pace.hydrogen_mass_da, constrain_hydrogens=False)
             try:
-                return spec, build_system(self.scene, spec), pace
+                return spec, build_system(self.scene, spec, rough=True), pace
             except PreparationError:
                 if name == QUANTUM:
                     raise

@@ -84,9 +84,9 @@ def test_a_molecule_that_the_reference_makes_another_is_not_learned() -> None:
 def test_hot_states_keep_their_bonds_and_turn_their_torsions() -> None:
     scene = scene_from_smiles("OCCO")
     with Labeller(scene, workers=1) as labeller:
-        found, again = (labeller.explore(24, (300.0, 600.0), seed=1) for _ in range(2))
+        found, again = (labeller.explore(48, (300.0, 600.0), seed=1) for _ in range(2))
     np.testing.assert_array_equal(found, again)
-    assert found.shape == (24, scene.n_atoms, 3)
+    assert found.shape == (48, scene.n_atoms, 3)
     for i, j in scene.bonds:
         rest = np.linalg.norm(scene.positions_nm[i] - scene.positions_nm[j])
         assert (np.abs(np.linalg.norm(found[:, i] - found[:, j], axis=-1) / rest - 1.0) < 0.3).all()

@@ -29,7 +29,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from md_reference.forces.gaff import load_openmm, rough_parameters
+from md_reference.forces.gaff import entry as gaff2
 from md_reference.forces.quantum import Potential
 from md_reference.forces.spec import ForceFieldSpec
 from md_reference.run.config import Conditions
@@ -150,7 +150,7 @@ def states_of(scene: Scene, smiles: str, n: int, seed: int) -> FloatArray:
     molecule = Chem.AddHs(Chem.MolFromSmiles(smiles))  # its atoms are in the order of the scene's
     numbers = list(AllChem.EmbedMultipleConfs(molecule, CONFORMERS - 1, randomSeed=seed % 2**31))
     starts = [scene.positions_nm, *(molecule.GetConformer(k).GetPositions() / 10.0 for k in numbers)]
-    system = load_openmm(rough_parameters(scene)).createSystem()
+    system = gaff2(scene, rough=True).system(scene)
     each = -(-n // (len(starts) * len(TEMPERATURES_K)))
     found = []
     for temperature_k in TEMPERATURES_K:
