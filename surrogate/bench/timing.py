@@ -14,16 +14,19 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
+import torch
 
 from md_reference.forces.spec import ForceFieldSpec
+from md_reference.run.config import Conditions
+from surrogate.models.weights import TrainingDomain, Weights
 from surrogate.sampling.chunks import ChunkSampler, noise_seed
+from surrogate.training.devices import product_speed
 from surrogate.verbs.options import CostErrorConfig
 from systems.scene import FloatArray
 
 if TYPE_CHECKING:
     from md_reference.run.engine import Engine
     from md_reference.simd.force_field import SimdReplicas
-    from surrogate.models.weights import TrainingDomain, Weights
 
 Frames = npt.NDArray[np.float64]
 # Of the MD that surrogates are timed beside.
@@ -35,10 +38,7 @@ OPENMM, SIMD = "openmm", "simd"
 def machine_facts() -> dict[str, Any]:
     """Return the machine's name, the load that was there before and the speed of its matrix products on torch's
     threads; JSON-able."""
-    import torch
-
     from md_reference.run.machine import machine_name
-    from surrogate.training.devices import product_speed
 
     (fp32, bf16), threads = product_speed(), torch.get_num_threads()
     products = f"products on {threads} threads: fp32 {fp32:.3g} GFLOP/s, bf16 {bf16 / fp32:.2g} times as fast"
@@ -149,7 +149,6 @@ def openmm_of(domain: TrainingDomain, timestep_ps: float, seed: int) -> Iterator
     """Yield OpenMM under the conditions of training, minimised and with velocities. Raises KeyError where the domain
     does not say one of these, and what `Engine` raises."""
     from md_reference.forces.forcefield import resolve
-    from md_reference.run.config import Conditions
     from md_reference.run.engine import Engine
 
     given = {name: value for name, value in domain.conditions.items() if value is not None}

@@ -21,6 +21,7 @@ from surrogate.comparison.measure.slow_motion import SLOW_KINDS
 from surrogate.comparison.measure.structure import Backbone, backbone
 from surrogate.comparison.measure.torsions import Torsion, find_torsions, find_wells
 from surrogate.comparison.read.ensemble import Ensemble
+from systems.chemistry.geometry import column_blocks, torsion_angle
 from systems.chemistry.validity import INVALID
 from systems.errors import InputError
 from systems.units import GAS_CONSTANT_KJ_MOL_K, format_time_ps
@@ -202,8 +203,6 @@ class _Torsions:
 
     def of(self, ensemble: Ensemble) -> list[FloatArray]:
         """Return angles `(n_frames, k)` rad per segment, times their fold; NaN where a frame is not finite."""
-        from systems.chemistry.geometry import column_blocks, torsion_angle
-
         out = []
         for segment in ensemble.segments:
             angles = np.empty((len(segment), len(self.quads)))

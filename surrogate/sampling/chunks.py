@@ -19,7 +19,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from time import perf_counter
-from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar, cast
+from typing import Any, NamedTuple, TypeVar, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -29,15 +29,13 @@ from surrogate.data import fitted_atoms
 from surrogate.models.layers import with_lean_parts
 from surrogate.models.potential import Potential
 from surrogate.models.propagator import Propagator, draw_noise
+from surrogate.models.weights import TrainingDomain, Weights
 from surrogate.sampling.config import RolloutConfig
 from surrogate.sampling.coupling import Coupling, PotentialChecks
 from surrogate.training.devices import choose_precision, keep_freed_memory, torch_threads
 from systems.chemistry import validity
 from systems.chemistry.geometry import superposition
 from systems.errors import InputError, SimulationError
-
-if TYPE_CHECKING:
-    from surrogate.models.weights import TrainingDomain, Weights
 
 FloatArray = npt.NDArray[np.floating[Any]]
 _Model = TypeVar("_Model", bound=Propagator)

@@ -13,13 +13,13 @@ import torch
 from surrogate.data import fitted_atoms
 from surrogate.models.potential import Potential
 from surrogate.models.propagator import Molecule
+from surrogate.models.weights import Weights
 from systems.chemistry.geometry import superposition
 from systems.errors import InputError, SurromdError
 from systems.units import whole_steps
 
 if TYPE_CHECKING:
     from md_reference.run.engine import Relaxed
-    from surrogate.models.weights import Weights
 
 
 FloatArray = npt.NDArray[np.floating[Any]]

@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -18,15 +18,13 @@ from surrogate.models.peptides.chains import FREE_ENDS
 from surrogate.models.peptides.layout import PeptideConfig, chain_features, standard_peptide
 from surrogate.models.peptides.model import PeptideSlide
 from surrogate.models.potential import Potential
+from surrogate.models.propagator import Propagator
 from surrogate.models.weights import TrainingDomain, Weights, load_weights, read_header
 from systems.chemistry.graph import match_atoms
 from systems.chemistry.validity import INVALID, NOT_FINITE, Geometry, check_frames, flag_names, geometry_from_scene
 from systems.errors import InputError, OutOfDomainError
 from systems.scene import Scene
 from systems.units import format_time_ps
-
-if TYPE_CHECKING:
-    from surrogate.models.propagator import Propagator
 
 
 @dataclass(frozen=True)

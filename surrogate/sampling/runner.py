@@ -10,13 +10,14 @@ from contextlib import ExitStack
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 import torch
 
 from surrogate.models.potential import Potential
+from surrogate.models.weights import Weights
 from surrogate.sampling.chunks import (
     Chunk,
     ChunkSampler,
@@ -40,9 +41,6 @@ from systems.trajectory import checkpoint
 from systems.trajectory.base import TrajectoryWriter
 from systems.trajectory.codec import DIFFERENCE_COLUMN, open_trajectory
 from systems.units import format_time_ps, whole_steps
-
-if TYPE_CHECKING:
-    from surrogate.models.weights import Weights
 
 # Plan of a rollout: everything that is settled before the first chunk.
 

@@ -16,6 +16,8 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save_file
 from torch import Tensor, nn
 
 from surrogate.training import devices
@@ -148,8 +150,6 @@ def tensor_checksum(text: str, tensors: Mapping[str, torch.Tensor]) -> str:
 
 def save_tensors(path: Path, kind: str, record: dict[str, Any], tensors: Mapping[str, Tensor], **more: str) -> None:
     """Write tensors with their record, in the metadata under the name `kind`, whole or not at all."""
-    from safetensors.torch import save_file
-
     kept = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
     text = json.dumps(record)
     metadata = {**more, kind: text, "sha256": tensor_checksum(text, kept)}
@@ -158,8 +158,6 @@ def save_tensors(path: Path, kind: str, record: dict[str, Any], tensors: Mapping
 
 def load_tensors(path: Path, kind: str) -> tuple[dict[str, Any], dict[str, Tensor]]:
     """Return record and tensors as they were saved. Raises InputError for a file that is damaged or another's."""
-    from safetensors import SafetensorError, safe_open
-
     try:
         with safe_open(path, framework="pt") as handle:
             metadata = handle.metadata()

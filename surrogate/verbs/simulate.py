@@ -10,6 +10,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from md_reference.campaign.manifest import COMPLETE, FAILED, campaign_folder, read_manifest
+from md_reference.forces.spec import ForceFieldSpec, at_level
+from md_reference.run.config import MDConfig, resolve_settings, resolved, to_config
 from surrogate.models.architecture import weights_path
 from surrogate.progress import ProgressFn, progress_bar
 from surrogate.sampling.config import RolloutConfig
@@ -22,15 +24,15 @@ from surrogate.verbs.options import (
     RolloutOptions,
     tell,
 )
+from systems.files.whole_file import replica_paths
 from systems.options import options_as_keywords, part_of
+from systems.scene import Scene
 from systems.trajectory.codec import WRITTEN
 from systems.trajectory.joined import join
 from systems.units import format_time_ps
 
 if TYPE_CHECKING:
     from md_reference.campaign.scheduler import CampaignProgress
-    from md_reference.run.simulate import MDConfig
-    from systems.scene import Scene
 
 
 @options_as_keywords(PlanOptions)
@@ -91,8 +93,6 @@ def reference(scene: str | Path | Scene, out: str | Path, options: ReferenceOpti
 
 def _outputs(out: Path, options: ReferenceOptions | RolloutOptions) -> tuple[list[Path], list[Path]]:
     """Return the files of replicas, and the one that joins them, if asked for; what cannot be meant is refused."""
-    from systems.files.whole_file import replica_paths
-
     outs = replica_paths(out, options.replicas)
     joined = [out] if options.join and len(outs) > 1 else []
     check_outputs([*outs, *joined], WRITTEN, resume=options.resume, overwrite=options.overwrite)
@@ -117,8 +117,6 @@ def resolve_run(
     options those count that are settings of a run (MDConfig, ForceFieldSpec) or make its box. Raises InputError."""
     from md_reference.forces.forcefield import resolve
     from md_reference.forces.solvation import require_molecules, solvate_if_asked
-    from md_reference.forces.spec import ForceFieldSpec, at_level
-    from md_reference.run.config import MDConfig, resolve_settings, resolved, to_config
 
     given = asdict(options) | {"force_field": at_level(options.level, options.force_field)}
     settings_of_a_run = {f.name for kind in (MDConfig, ForceFieldSpec) for f in fields(kind)} - {"hydrogen_mass_da"}

@@ -17,19 +17,21 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from surrogate.models.architecture import architecture, names, weights_path
+from md_reference.forces.spec import QUANTUM, at_level
+from surrogate.models.architecture import Trainer, TrainingRequest, architecture, names, toml_text, weights_path
 from surrogate.progress import progress_bar
 from surrogate.verbs.inputs import check_outputs, find_trajectories, prepare_scene
 from surrogate.verbs.options import PathLike, TrainOptions, Trajectories, WindowsOptions, tell
+from systems.chemistry.validity import flag_names
 from systems.errors import InputError, SurromdError
 from systems.files.whole_file import OutputLock, create_whole
 from systems.options import Preparation, options_as_keywords
 from systems.scene import Scene
+from systems.trajectory.codec import open_trajectory
 from systems.units import format_time_ps
 
 if TYPE_CHECKING:
     from surrogate.data import References
-    from surrogate.models.architecture import Trainer, TrainingRequest
     from surrogate.models.potential import Potential
     from surrogate.models.weights import Weights
 
@@ -145,8 +147,6 @@ def explain_training(references: Trajectories, options: TrainOptions) -> str:
     Given as `config` of `train` it gives the same training. What was chosen stands at its head, with the reasons.
     Budget, seed and device belong to the command and are left out. Raises InputError, TrajectoryError.
     """
-    from surrogate.models.architecture import toml_text
-
     if options.level is not None:
         raise InputError("`explain` is for trainings on trajectories; leave `level` out.")
     asked = _asked(options, Path("explained.safetensors"))
@@ -159,8 +159,6 @@ def explain_training(references: Trajectories, options: TrainOptions) -> str:
 
 def _asked(options: TrainOptions, out: Path) -> TrainingRequest:
     """Return the request; `arch` is empty where nothing names one. Raises InputError for an unknown one."""
-    from surrogate.models.architecture import TrainingRequest
-
     start, arch = options.start_from, options.arch
     file = None if start is None else weights_path(start)
     if arch is None and file is not None:
@@ -257,8 +255,6 @@ def learn_molecule(
     for what the level of theory refuses.
     """
     began = time.monotonic()
-    from md_reference.forces.spec import QUANTUM, at_level
-
     if at_level(options.level, None) != QUANTUM:
         raise InputError(
             f"a level is worth learning where it is expensive; use `level='{QUANTUM}'`, or a reference of MD."
@@ -396,8 +392,6 @@ def _roll(weights: Weights) -> tuple[float, int, Counter[str], int, str]:
     frames of all, how many the guards caught and why, and what stopped the rollout."""
     from surrogate.sampling.chunks import caught
     from surrogate.sampling.runner import RolloutConfig, rollout
-    from systems.chemistry.validity import flag_names
-    from systems.trajectory.codec import open_trajectory
 
     time_ps, n_frames, n_caught, reasons, stopped = 0.0, 0, 0, Counter[str](), ""
     members, lag_ps = weights.domain.members, weights.domain.lag_ps

@@ -12,9 +12,11 @@ from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import replace
 from datetime import UTC, datetime
+from importlib.metadata import version
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeVar
+from typing import TypeVar
 
+from md_reference.run.config import MDConfig
 from surrogate.progress import ProgressFn, progress_bar
 from surrogate.verbs.inputs import prepare_scene
 from surrogate.verbs.options import RunOptions, tell
@@ -37,11 +39,8 @@ from surrogate.verbs.simulate import resolve_run
 from systems.errors import InputError, SimulationError, SurromdError
 from systems.files.whole_file import OutputLock
 from systems.interrupts import deferred_interrupt, stop_when
+from systems.scene import Scene
 from systems.units import format_wall
-
-if TYPE_CHECKING:
-    from md_reference.run.config import MDConfig
-    from systems.scene import Scene
 
 T = TypeVar("T")
 LOG_NAME = "log.txt"
@@ -331,8 +330,6 @@ def _prepared(scene: str | Path | Scene, options: RunOptions) -> tuple[Scene, MD
 
 
 def _new_record(scene: str | Path | Scene, molecule: Scene, options: RunOptions) -> RunRecord:
-    from importlib.metadata import version
-
     import openmm
 
     programs = {"surromd": version("surromd"), "openmm": openmm.__version__, "python": sys.version.split()[0]}

@@ -14,7 +14,7 @@ from dataclasses import dataclass, field, fields, replace
 from html import escape
 from importlib.resources import files
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 from urllib.parse import quote
 
 from md_reference.campaign.campaign_file import (
@@ -35,10 +35,8 @@ from systems.files.outside import content
 from systems.files.whole_file import create_whole
 from systems.interrupts import deferred_interrupt
 from systems.options import Preparation, options_as_keywords
+from systems.scene import Scene
 from systems.units import format_time_ps, format_wall
-
-if TYPE_CHECKING:
-    from systems.scene import Scene
 
 LIST_NAME, PAGE_NAME, RESULTS_NAME = "molecules.txt", "index.html", "results.json"
 _HEADS = (
