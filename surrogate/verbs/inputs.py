@@ -66,9 +66,8 @@ def prepare_scene(scene: str | Path | Scene, options: Preparation, *, quiet: boo
         return scene
     scene = str(scene)
     prepared = named_scenes.prepare(scene, options=part_of(options, Preparation))
-    if not quiet:
-        for line in prepared.provenance.get("repairs", []):
-            tell(scene, line)
+    for line in prepared.provenance.get("repairs", []):
+        tell(scene, line, quiet=quiet)
     return prepared
 
 

@@ -12,6 +12,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -106,27 +107,20 @@ def train(references: Trajectories, out: PathLike, options: TrainOptions) -> Pat
         if not options.quiet:
             tell(out.name, "this training is done, and nothing was changed; overwrite it to train anew")
         return out
-    if options.level is not None:
-        with OutputLock(out), progress_bar(f"training {out.stem}", quiet=options.quiet) as bar, _said_when_stopped(out):
-            written = learn_molecule(references, asked, options, _shown(bar))
-        _conclude(written, fitted=False, quiet=options.quiet)
-        return written
-    from surrogate.training.devices import choose_device
+    if options.level is None:
+        from surrogate.training.devices import choose_device
 
-    trainer, found, asked, lines = _plan(
-        references, options.validation, replace(asked, device=choose_device(options.device))
-    )
-    prepared = trainer.prepare(found, asked)
-    if not options.quiet:
+        asked = replace(asked, device=choose_device(options.device))
+        trainer, found, asked, lines = _plan(references, options.validation, asked)
+        prepared = trainer.prepare(found, asked)
         for line in lines:
-            tell(out.name, line)
-    with (
-        OutputLock(out),
-        progress_bar(f"training {prepared.scene}", quiet=options.quiet) as bar,
-        _said_when_stopped(out),
-    ):
-        written = prepared.start(_shown(bar))
-    _conclude(written, fitted=trainer.fitted, quiet=options.quiet)
+            tell(out.name, line, quiet=options.quiet)
+        name, fitted, start = prepared.scene, trainer.fitted, prepared.start
+    else:
+        name, fitted, start = out.stem, False, partial(learn_molecule, references, asked, options)
+    with OutputLock(out), progress_bar(f"training {name}", quiet=options.quiet) as bar, _said_when_stopped(out):
+        written = start(_shown(bar))
+    _conclude(written, fitted=fitted, quiet=options.quiet)
     return written
 
 
@@ -237,9 +231,8 @@ def _conclude(written: Path, *, fitted: bool, quiet: bool) -> None:
     except KeyboardInterrupt:
         raise KeyboardInterrupt(f"{written} is written; only the rollout that tries it was cut short") from None
     create_whole(written.with_suffix(".verdict.json"), json.dumps(asdict(verdict), indent=1) + "\n")
-    if not quiet:
-        for line in verdict.lines():
-            tell(written.name, line)
+    for line in verdict.lines():
+        tell(written.name, line, quiet=quiet)
 
 
 # ---- one molecule ----------------------------------------------------------------------------------------------------
@@ -285,10 +278,9 @@ def learn_molecule(
             tell(request.out.name, f"{scene.name} ({scene.formula}) by {QUANTUM}; weights know this molecule alone")
         after_s = trial_s(PainetPotential(config), scene)
         out = trainer.learn(reference, request, advance, before_s=time.monotonic() - began, after_s=after_s)
-        if reference.n_rearranged and not options.quiet:
-            tell(
-                out.name, f"{reference.n_rearranged} states left out: they are another molecule, by bonds or handedness"
-            )
+        if n := reference.n_rearranged:
+            left_out = f"{n} states left out: they are another molecule, by bonds or handedness"
+            tell(out.name, left_out, quiet=options.quiet)
         return out
 
 

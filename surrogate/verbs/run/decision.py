@@ -188,7 +188,7 @@ def _interval(rates: Rates, way: Way, least_ps: float) -> float:
 
 
 def expected_errors(
-    rates: Rates, budget_s: float, relaxation_ps: float | None = None, model_error: float | None = None
+    rates: Rates, budget_s: float, relaxation_ps: float | None = None, model_error: float = MODEL_ERROR
 ) -> dict[str, float]:
     """Return the error to expect of the population of a state at the end of a budget, by each way to spend it.
 
@@ -199,7 +199,6 @@ def expected_errors(
     that the states may have; from frames of a rollout it is that rollout's own error, `model_error` (0.1 unless
     given) included.
     """
-    model_error = MODEL_ERROR if model_error is None else model_error
     relaxation_ps = max(rates.relaxation_ps if relaxation_ps is None else relaxation_ps, 1e-3)
     seconds = (1.0 - _REPORT_SHARE) * budget_s
 

@@ -206,8 +206,7 @@ class _Run:
         """Write a line into the log, and show it."""
         with open(self._folder / LOG_NAME, "a", encoding="utf-8") as file:
             file.write(f"{datetime.now(UTC).isoformat(timespec='seconds')} {line}\n")
-        if not self._quiet:
-            tell(self._name, line)
+        tell(self._name, line, quiet=self._quiet)
 
     def before_stages(self, doing: str, work: Callable[[], T]) -> T:
         """Return what comes of work that is done before there are stages. Raises InputError where the budget ends
