@@ -14,15 +14,12 @@ from surrogate.data import fitted_atoms
 from surrogate.models.potential import Potential
 from surrogate.models.propagator import Molecule
 from surrogate.models.weights import Weights
-from systems.chemistry.geometry import superposition
+from systems.chemistry.geometry import FloatArray, superposition
 from systems.errors import InputError, SurromdError
 from systems.units import whole_steps
 
 if TYPE_CHECKING:
     from md_reference.run.engine import Relaxed
-
-
-FloatArray = npt.NDArray[np.floating[Any]]
 
 
 class Segment(NamedTuple):
