@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import h5py
 import numpy as np
@@ -385,8 +385,7 @@ def strides_up_to(longest: int) -> tuple[int, ...]:
     return tuple(sorted({round(float(x)) for x in np.geomspace(1, longest, n)})) if longest > 1 else (1,)
 
 
-@dataclass(frozen=True, eq=False)
-class StrideSampler:
+class StrideSampler(NamedTuple):
     """Draws windows of any of `strides`, each as likely; `starts[k]` (n_k,) are the first frames of those of stride
     k."""
 
@@ -426,8 +425,7 @@ class StrideSampler:
         return first, torch.tensor(self.strides)[which]
 
 
-@dataclass(frozen=True, eq=False)
-class FrameSets:
+class FrameSets(NamedTuple):
     """Frames of several molecules. Those `trained` on hold their own validation stretches; those of `unseen` are held
     out whole: curves are measured on them, and nothing is learned from them."""
 
@@ -445,8 +443,7 @@ class FrameSets:
         return {"reference_ns": sum(frames.total_ps for frames in self.trained) * 1e-3, "sources": sources}
 
 
-@dataclass(frozen=True, eq=False)
-class Survey:
+class Survey(NamedTuple):
     """A summary of the trajectories to train on, made without reading their frames.
 
     `scenes`: each molecule trained on once; `unseen`: those that appear in the validation alone. `longest`: frames of

@@ -19,7 +19,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass
 from itertools import product
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -218,8 +218,7 @@ def _earlier(folder: Path, header: dict[str, Any]) -> dict[str, Any]:
 # ---- errors against held-out reference -----------------------------------------------------------------------------
 
 
-@dataclass(frozen=True, eq=False)
-class HeldOut:
+class HeldOut(NamedTuple):
     """Held-out reference and its replicate, measured once. `length_ps`: of each, as far as they are compared."""
 
     scene: Scene

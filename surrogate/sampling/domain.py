@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import pairwise
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -27,8 +27,7 @@ from systems.scene import Scene
 from systems.units import format_time_ps
 
 
-@dataclass(frozen=True)
-class Deviation:
+class Deviation(NamedTuple):
     """One way in which a scene leaves the training domain: `what` (molecule, start or temperature, of an unseen peptide
     also residues, size or ends), the `reason` in words, and whether the model can be run nevertheless (`forcible`)."""
 
@@ -169,8 +168,7 @@ def at_lag(weights: Weights, domain: TrainingDomain, lag_ps: float) -> Weights:
 TEMPERATURE_TOLERANCE_K = 0.5
 
 
-@dataclass(frozen=True, eq=False)
-class DomainMatch:
+class DomainMatch(NamedTuple):
     """How a scene fits weights. `order (n_atoms,)`: model atom k is scene atom `order[k]`; `domain`: training domain of
     the scene's molecule; `deviations`: those that `force` overruled; `seen`: whether the molecule was trained on;
     `nearness`: of an unseen peptide, how near to it training comes, in words."""

@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from safetensors import SafetensorError, safe_open
@@ -255,8 +255,7 @@ class Ema:
             p.copy_(self.shadow[name])
 
 
-@dataclass(frozen=True, eq=False)
-class Stage:
+class Stage(NamedTuple):
     """One stage of a training: the `module` that it trains, and how.
 
     `loss(generator)` draws its own batch from the generator, so that a resumed run draws what an uninterrupted one
@@ -270,8 +269,7 @@ class Stage:
     saves: bool = True
 
 
-@dataclass(frozen=True)
-class StagePlace:
+class StagePlace(NamedTuple):
     """Where a stage runs and writes: its resume `state` (.safetensors), the `log` of its curves (.csv), the device.
     `resume`: go on from the state, where there is one."""
 
@@ -369,12 +367,9 @@ def train_stages(
     if not resume:
         forget(log)
     for stage in stages:
-
-        def save(now_s: float) -> None:
-            write([*spent_s, now_s])
-
         place = StagePlace(out.with_name(f"{out.stem}.{stage.config.name}.train.safetensors"), log, device, resume)
-        spent_s.append(run_stage(stage, place, progress=progress, on_save=save if stage.saves else None))
+        on_save = (lambda now_s: write([*spent_s, now_s])) if stage.saves else None
+        spent_s.append(run_stage(stage, place, progress=progress, on_save=on_save))
     write(spent_s)
     forget()
 
