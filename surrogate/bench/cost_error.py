@@ -426,10 +426,8 @@ def markdown(result: dict[str, Any]) -> str:
     by_length = "; ".join(
         f"{1e-3 * ps:.3g} ns {error:.3f} [{low:.3f}, {high:.3f}]" for ps, error, low, high in zip(*columns, strict=True)
     )
-    slow, counted = (
-        md["slowest"],
-        "No torsion relaxes 50 times over in the MD at hand: effective samples are not counted.",
-    )
+    slow = md["slowest"]
+    counted = "No torsion relaxes 50 times over in the MD at hand: effective samples are not counted."
     if slow is not None:
         counted = (
             f"Effective samples: simulated time over 2 max(τ, τ of MD) of {slow['name']} (MD: {slow['tau_ps']:.1f} ps, "
