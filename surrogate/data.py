@@ -10,8 +10,9 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any, NamedTuple
 
+import h5py
 import numpy as np
 import numpy.typing as npt
 import torch
@@ -23,12 +24,10 @@ from systems.errors import InputError, TrajectoryError, first_line
 from systems.files.schema import built, parsed
 from systems.files.whole_file import create_whole
 from systems.scene import Scene
+from systems.trajectory.base import TrajectoryReader
+from systems.trajectory.codec import open_trajectory
+from systems.trajectory.joined import refuse_joined
 from systems.trajectory.store import open_hdf5
-
-if TYPE_CHECKING:
-    import h5py
-
-    from systems.trajectory.base import TrajectoryReader
 
 # Successive frames that must agree for a leak: one may coincide by chance in a system of one particle, a run does not.
 RUN = 4
@@ -182,8 +181,6 @@ class TrainingFrames:
 
     def save(self, path: str | Path) -> None:
         """Write one HDF5 file that `load_frames` takes back; it appears whole or not at all."""
-        import h5py
-
         if self.turn is not None:
             raise InputError("frames that have been posed anew are not kept; save them as they were read.")
         header = {"scene": self.scene.to_dict(), "lag_ps": self.lag_ps, "canonical": self.canonical,
@@ -258,8 +255,6 @@ def collect_frames(
     `held`: trajectories that are held out whole; without any, the end of each is. More than `memory_bytes` of frames
     are kept in a nameless file in the folder `spool`, mapped, which goes when the process does.
     """
-    from systems.trajectory.codec import open_trajectory
-
     if velocities and canonical:
         raise InputError("frames with velocities keep their own pose; they cannot be canonical as well.")
     files = [*paths, *held]
@@ -296,9 +291,6 @@ def collect_frames(
 def _agreed(paths: list[Path]) -> tuple[Scene, float, dict[str, Any], npt.NDArray[np.int64]]:
     """Return scene, time between frames, conditions and `starts` of trajectories of which no frame is read yet. Raises
     InputError when they do not go together."""
-    from systems.trajectory.codec import open_trajectory
-    from systems.trajectory.joined import refuse_joined
-
     scene: Scene | None = None
     lag_ps, conditions, lengths = 0.0, dict[str, Any](), [0]
     for path in paths:
@@ -393,8 +385,7 @@ def strides_up_to(longest: int) -> tuple[int, ...]:
     return tuple(sorted({round(float(x)) for x in np.geomspace(1, longest, n)})) if longest > 1 else (1,)
 
 
-@dataclass(frozen=True, eq=False)
-class StrideSampler:
+class StrideSampler(NamedTuple):
     """Draws windows of any of `strides`, each as likely; `starts[k]` (n_k,) are the first frames of those of stride
     k."""
 
@@ -434,8 +425,7 @@ class StrideSampler:
         return first, torch.tensor(self.strides)[which]
 
 
-@dataclass(frozen=True, eq=False)
-class FrameSets:
+class FrameSets(NamedTuple):
     """Frames of several molecules. Those `trained` on hold their own validation stretches; those of `unseen` are held
     out whole: curves are measured on them, and nothing is learned from them."""
 
@@ -453,8 +443,7 @@ class FrameSets:
         return {"reference_ns": sum(frames.total_ps for frames in self.trained) * 1e-3, "sources": sources}
 
 
-@dataclass(frozen=True, eq=False)
-class Survey:
+class Survey(NamedTuple):
     """A summary of the trajectories to train on, made without reading their frames.
 
     `scenes`: each molecule trained on once; `unseen`: those that appear in the validation alone. `longest`: frames of
@@ -577,8 +566,6 @@ def _pose(frames: TrainingFrames) -> TrainingFrames:
 def _summary(path: Path) -> tuple[Scene, int, float, bool]:
     """Return a file's scene, the frames of its longest trajectory, the time between frames, and whether it was
     simulated at constant temperature."""
-    from systems.trajectory.codec import open_trajectory
-
     if is_windows(path):
         frames = load_frames(path)
         constant = frames.conditions.get("temperature_k") is not None

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Protocol
+
+from systems.units import format_time_ps
 
 _LONGEST = 44
 
@@ -26,8 +29,6 @@ def progress_bar(label: str, *, quiet: bool, ps_per_frame: float | None = None) 
     if quiet:
         yield None
         return
-    import time
-
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
 
@@ -69,8 +70,6 @@ def progress_bar(label: str, *, quiet: bool, ps_per_frame: float | None = None) 
 def _note(done: int, total: int, per_s: float, ps_per_frame: float | None) -> str:
     if ps_per_frame is None:
         return f"{done}/{total}"
-    from systems.units import format_time_ps
-
     text = f"{format_time_ps(total * ps_per_frame)}"
     if per_s > 0:
         text += f" at {per_s * ps_per_frame * 86400e-6:.3g} µs/day"

@@ -19,7 +19,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass
 from itertools import product
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -45,6 +45,10 @@ from surrogate.comparison.measure.structure import Baseline, Features, backbone
 from surrogate.comparison.read.ensemble import Ensemble, load_ensemble
 from surrogate.comparison.rows.kinetics_rows import relaxation_of, turning
 from surrogate.comparison.rows.rows import Options, Sample, make_sample
+from surrogate.data import collect_frames
+from surrogate.models.architecture import weights_path
+from surrogate.models.lam_slide.flow import ADAPTIVE
+from surrogate.models.weights import Weights, load_weights
 from surrogate.sampling.chunks import ChunkSampler
 from surrogate.sampling.domain import fit_weights
 from surrogate.training.devices import torch_threads
@@ -57,9 +61,6 @@ from systems.options import part_of
 from systems.scene import Scene
 from systems.trajectory.codec import open_trajectory
 from systems.units import format_time_ps
-
-if TYPE_CHECKING:
-    from surrogate.models.weights import Weights
 
 ReportFn = Callable[[str], None]
 CHECKS = {
@@ -97,9 +98,6 @@ def cost_error(
     report: ReportFn = lambda line: None,
 ) -> dict[str, Any]:
     """Measure weights, by name or file, at the settings of `choose_settings`; see `run_cost_error`."""
-    from surrogate.models.architecture import weights_path
-    from surrogate.models.weights import load_weights
-
     loaded = [load_weights(weights_path(name)) for name in weights]
     sweep = part_of(options, Sweep)
     chosen = [(one, choose_settings(one, sweep)) for one in loaded]  # what cannot be is said before anything is read
@@ -110,8 +108,6 @@ def cost_error(
 def choose_settings(weights: Weights, sweep: Sweep) -> list[Setting]:
     """Return all combinations of what is asked for; without solvers those that take a batch at once. Raises InputError
     for a solver that the weights do not know."""
-    from surrogate.models.lam_slide.flow import ADAPTIVE
-
     known = weights.model.solvers
     unknown = [name for name in sweep.solvers or () if name not in known]
     if unknown:
@@ -222,8 +218,7 @@ def _earlier(folder: Path, header: dict[str, Any]) -> dict[str, Any]:
 # ---- errors against held-out reference -----------------------------------------------------------------------------
 
 
-@dataclass(frozen=True, eq=False)
-class HeldOut:
+class HeldOut(NamedTuple):
     """Held-out reference and its replicate, measured once. `length_ps`: of each, as far as they are compared."""
 
     scene: Scene
@@ -372,8 +367,6 @@ def refuse_trained_on(
     training; an interval between the frames that are compared (`lag_ps`, or all) that the weights do not step to; and
     motion that reference and replicate have in common (`data.frames.refuse_leaks`).
     """
-    from surrogate.data import collect_frames
-
     domain, name = weights.domain, weights.path.name
     canonical = getattr(weights.model.config, "canonical", True)
     frames = collect_frames(list(reference), canonical=canonical, held=list(replicate))
@@ -433,10 +426,8 @@ def markdown(result: dict[str, Any]) -> str:
     by_length = "; ".join(
         f"{1e-3 * ps:.3g} ns {error:.3f} [{low:.3f}, {high:.3f}]" for ps, error, low, high in zip(*columns, strict=True)
     )
-    slow, counted = (
-        md["slowest"],
-        "No torsion relaxes 50 times over in the MD at hand: effective samples are not counted.",
-    )
+    slow = md["slowest"]
+    counted = "No torsion relaxes 50 times over in the MD at hand: effective samples are not counted."
     if slow is not None:
         counted = (
             f"Effective samples: simulated time over 2 max(τ, τ of MD) of {slow['name']} (MD: {slow['tau_ps']:.1f} ps, "

@@ -9,27 +9,28 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from surrogate.bench.timing import Roller, machine_facts, markdown_table, openmm_of
 from surrogate.comparison.measure.distributions import distance
+from surrogate.models.architecture import weights_path
+from surrogate.models.weights import Weights, load_weights
 from surrogate.sampling.chunks import ChunkSampler
 from surrogate.sampling.config import RolloutConfig
 from surrogate.sampling.domain import find_deviations, fit_weights, match_domain
+from surrogate.sampling.runner import rollout
+from surrogate.verbs.options import StressOptions
 from systems.chemistry.geometry import torsion
 from systems.chemistry.graph import rotatable_torsions
 from systems.chemistry.validity import BOND_HALF_ANGSTROM, INVALID, NOT_FINITE, Geometry, check_frames
 from systems.errors import InputError, OutOfDomainError, SimulationError, StorageError, SurromdError
 from systems.files.whole_file import create_whole
+from systems.library.named_scenes import prepare
 from systems.scene import FloatArray, IntArray, Scene, part_of
 from systems.trajectory.codec import open_trajectory
-
-if TYPE_CHECKING:
-    from surrogate.models.weights import Weights
-    from surrogate.verbs.options import StressOptions
 
 Frames = npt.NDArray[np.floating[Any]]
 ReportFn = Callable[[str], None]
@@ -59,13 +60,8 @@ def stress(
     they were trained on. `report` is called with each section as it begins. Raises SurromdError for weights that cannot
     be loaded or do not cover the scene, and what cannot be written; KeyboardInterrupt says what is kept.
     """
-    from surrogate.models.architecture import weights_path
-    from surrogate.models.weights import load_weights
-
     loaded = load_weights(weights_path(weights)) if isinstance(weights, str | Path) else weights
     if options.scene is not None:
-        from systems.library.named_scenes import prepare
-
         loaded, _ = fit_weights(prepare(options.scene), loaded)
     elif loaded.domain.transferable:
         loaded, _ = fit_weights(loaded.domain.scene, loaded)
@@ -190,8 +186,6 @@ def measure_length(
 ) -> dict[str, Any]:
     """Return validity, drift and speed of a rollout of `n_frames` in all replicas together, under a guard; its files
     stay in `folder`."""
-    from surrogate.sampling.runner import rollout
-
     scene, lag_ps = weights.domain.scene, weights.domain.lag_ps
     outs = [folder / f"{guard}_{n_frames}_r{k}.h5" for k in range(replicas)]
     row: dict[str, Any] = {"guard": guard, "replicas": replicas, "frames": n_frames}

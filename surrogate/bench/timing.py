@@ -10,20 +10,24 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
 from itertools import pairwise
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+import torch
 
+from md_reference.forces.forcefield import build_system, resolve
 from md_reference.forces.spec import ForceFieldSpec
+from md_reference.run.config import Conditions
+from md_reference.run.engine import Engine
+from md_reference.run.machine import machine_name
+from md_reference.simd.force_field import SimdReplicas
+from md_reference.simd.system_terms import SimdUnavailableError
+from surrogate.models.weights import TrainingDomain, Weights
 from surrogate.sampling.chunks import ChunkSampler, noise_seed
+from surrogate.training.devices import product_speed
 from surrogate.verbs.options import CostErrorConfig
 from systems.scene import FloatArray
-
-if TYPE_CHECKING:
-    from md_reference.run.engine import Engine
-    from md_reference.simd.force_field import SimdReplicas
-    from surrogate.models.weights import TrainingDomain, Weights
 
 Frames = npt.NDArray[np.float64]
 # Of the MD that surrogates are timed beside.
@@ -35,11 +39,6 @@ OPENMM, SIMD = "openmm", "simd"
 def machine_facts() -> dict[str, Any]:
     """Return the machine's name, the load that was there before and the speed of its matrix products on torch's
     threads; JSON-able."""
-    import torch
-
-    from md_reference.run.machine import machine_name
-    from surrogate.training.devices import product_speed
-
     (fp32, bf16), threads = product_speed(), torch.get_num_threads()
     products = f"products on {threads} threads: fp32 {fp32:.3g} GFLOP/s, bf16 {bf16 / fp32:.2g} times as fast"
     return {
@@ -148,10 +147,6 @@ def _spread(values: Sequence[float], shares: Sequence[float] | None = None) -> d
 def openmm_of(domain: TrainingDomain, timestep_ps: float, seed: int) -> Iterator[Engine]:
     """Yield OpenMM under the conditions of training, minimised and with velocities. Raises KeyError where the domain
     does not say one of these, and what `Engine` raises."""
-    from md_reference.forces.forcefield import resolve
-    from md_reference.run.config import Conditions
-    from md_reference.run.engine import Engine
-
     given = {name: value for name, value in domain.conditions.items() if value is not None}
     conditions = Conditions(
         force=resolve(domain.scene, ForceFieldSpec.of(given)),
@@ -168,10 +163,6 @@ def openmm_of(domain: TrainingDomain, timestep_ps: float, seed: int) -> Iterator
 
 def _by_simd(weights: Weights, config: CostErrorConfig) -> SimdReplicas | None:
     """Return copies of the molecule by SIMD, equilibrated; None where this machine or the force field has none."""
-    from md_reference.forces.forcefield import build_system, resolve
-    from md_reference.simd.force_field import SimdReplicas
-    from md_reference.simd.system_terms import SimdUnavailableError
-
     scene, given = weights.domain.scene, weights.domain.conditions
     try:
         system = build_system(scene, resolve(scene, ForceFieldSpec.of(given)))

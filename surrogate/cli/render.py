@@ -3,6 +3,7 @@ keywords become flags."""
 
 from __future__ import annotations
 
+import json
 import re
 from collections.abc import Iterator
 from functools import cache
@@ -11,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import typer
 
+import surrogate as sm
 from surrogate.verbs.options import VERB_OPTIONS, CostErrorOptions, StressOptions
 from systems.files.outside import printable
 from systems.options import Option, options_of
@@ -57,8 +59,6 @@ def _say(text: str) -> None:
 
 def print_json(value: Any) -> None:
     """Print a value as indented JSON on stdout."""
-    import json
-
     _say(json.dumps(value, indent=2, default=str))
 
 
@@ -111,8 +111,6 @@ def print_library(entries: list[dict[str, Any]]) -> None:
 
 def print_written(paths: list[Path], as_json: bool, quiet: bool) -> None:
     """Say what was written: its length, what it cost, and how the run went."""
-    import surrogate as sm
-
     records = [sm.info(path) for path in paths] if as_json or not quiet else []
     if as_json:
         return print_json(records)

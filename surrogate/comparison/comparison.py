@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from html import escape
+from importlib.metadata import PackageNotFoundError, version
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -143,8 +145,6 @@ class Comparison:
 
     def _repr_html_(self) -> str:
         """Return the same for a notebook."""
-        from html import escape
-
         return "".join(
             f"<p><b>{escape(j.summary.label)}: {escape(j.in_short[0])}</b><br>"
             f"{'<br>'.join(map(escape, j.in_short[1:]))}</p>"
@@ -407,8 +407,6 @@ def _jump_notes(features: Features) -> list[str]:
 
 
 def _versions() -> dict[str, str]:
-    from importlib.metadata import PackageNotFoundError, version
-
     found = {}
     for package in ("surromd", "numpy", "scipy", "deeptime"):
         try:

@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
@@ -84,8 +84,7 @@ class EquivalentTime:
         return float(np.exp(np.interp(at, np.log(self.lengths_ps), np.log(np.maximum(self.errors, 1e-12)))))
 
 
-@dataclass(frozen=True, eq=False)
-class Measure:
+class Measure(NamedTuple):
     """A squared distance between two trajectories, made of sums over blocks of frames. `sums` are of (reference,
     candidate, replicate), `(n_blocks, n_sums)`, the first and the last in equal parts of equal lengths in order of
     time; `squared(p, q)` maps sums `(n, n_sums)` of a trajectory and `(n_sums,)` of the reference to squared distances

@@ -12,17 +12,13 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
 from surrogate.comparison.measure.kinetics import block_transitions
-from surrogate.comparison.measure.statistics import Blocks, Piece
+from surrogate.comparison.measure.statistics import Blocks, BoolArray, FloatArray, IntArray, Piece
 from systems.errors import InputError
-
-FloatArray = npt.NDArray[np.float64]
-IntArray = npt.NDArray[np.int64]
 
 _N_DRAWS, _FLAT_DRAWS = 50, 20
 # Of the likelihood's fixed point: change of log populations in a step at its end, most steps, and longest jumps, in
@@ -46,8 +42,7 @@ _NAMED_SHARE = 0.005
 Fate = Literal["only begun in", "entered and never left", "left and never entered"]
 
 
-@dataclass(frozen=True)
-class Unconnected:
+class Unconnected(NamedTuple):
     """States that transitions do not connect with the others in both directions: which microstates, their share of
     all frames, in how many replicas, and what happened there."""
 
@@ -362,7 +357,7 @@ def _chapman_kolmogorov(
         power = np.linalg.matrix_power(model.matrix, multiple)
         by_unit = _counts(micro, units, model.n, lag)[:, model.kept][:, :, model.kept]
 
-        def observed(counts: FloatArray, side: npt.NDArray[np.bool_]) -> float:
+        def observed(counts: FloatArray, side: BoolArray) -> float:
             rows = counts[side]
             with np.errstate(invalid="ignore", divide="ignore"):
                 stay = rows[:, side].sum(1) / rows.sum(1)

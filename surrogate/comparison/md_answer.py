@@ -17,17 +17,17 @@ import numpy.typing as npt
 from surrogate.comparison.markov import Equilibrium, equilibrium, with_mean_one
 from surrogate.comparison.measure import kinetics
 from surrogate.comparison.measure.distributions import is_alpha
+from surrogate.comparison.measure.movie import pick_frames
 from surrogate.comparison.measure.slow_motion import SLOW_KINDS
+from surrogate.comparison.measure.statistics import FloatArray, IntArray
 from surrogate.comparison.measure.structure import Backbone, backbone
 from surrogate.comparison.measure.torsions import Torsion, find_torsions, find_wells
 from surrogate.comparison.read.ensemble import Ensemble
+from systems.chemistry.geometry import column_blocks, torsion_angle
 from systems.chemistry.validity import INVALID
 from systems.errors import InputError
 from systems.scene import Scene, neighbours_of
 from systems.units import GAS_CONSTANT_KJ_MOL_K, format_time_ps
-
-FloatArray = npt.NDArray[np.float64]
-IntArray = npt.NDArray[np.int64]
 
 _TICA_LAG_PS = 10.0
 _DIMENSIONS, _MICROSTATES, _FRAMES_A_MICROSTATE = 8, 100, 50
@@ -205,8 +205,6 @@ class _Torsions:
 
     def of(self, ensemble: Ensemble) -> list[FloatArray]:
         """Return angles `(n_frames, k)` rad per segment, times their fold; NaN where a frame is not finite."""
-        from systems.chemistry.geometry import column_blocks, torsion_angle
-
         out = []
         for segment in ensemble.segments:
             angles = np.empty((len(segment), len(self.quads)))
@@ -251,12 +249,13 @@ def md_answer(md: Ensemble, temperature_k: float, *, surrogate: Ensemble | None 
     own = torsions.of(surrogate) if surrogate is not None else None
     states: list[StateEnergy] = []
     missing: list[str] = []
-    for name, labels, names, rolled in _named_states(torsions, angles, own):
+    named = _named_states(torsions, angles, own)
+    for name, labels, names, rolled in named:
         states += _energies(found, micro, (name, names), labels, rolled, temperature_k)
     for lost in found.unconnected:
         # What is left for good has no weight, rightly.
         if lost.fate != "left and never entered":
-            where = _where(lost.microstates, micro, states, torsions, angles, own)
+            where = _where(lost.microstates, micro, named)
             missing.append(f"not connected: {where} was {lost.fate} ({lost.n_replicas} of {len(micro)} replicas)")
     states = [_said_missing(s) for s in states]
     missing += [
@@ -404,14 +403,11 @@ def _own_shares(labels: list[IntArray], n: int) -> tuple[FloatArray, FloatArray]
     return each.mean(0), each.std(0, ddof=1) / math.sqrt(len(each)) if len(each) > 1 else np.zeros(n)
 
 
-def _where(
-    lost: Sequence[int], micro: list[IntArray], states: list[StateEnergy], torsions: _Torsions,
-    angles: list[FloatArray], own: list[FloatArray] | None,
-) -> str:  # fmt: skip
+def _where(lost: Sequence[int], micro: list[IntArray], named: list[Named]) -> str:
     """Return the state of one torsion that tells unconnected microstates from the rest best."""
     inside = np.isin(np.concatenate(micro), lost)
     best, said = 0.0, "a state"
-    for name, labels, names, _ in _named_states(torsions, angles, own):
+    for name, labels, names, _ in named:
         every = np.concatenate(labels)
         for s, state in enumerate(names):
             apart = float((every[inside] == s).mean() - (every[~inside] == s).mean()) if (~inside).any() else 0.0
@@ -461,10 +457,4 @@ def frames_over_states(ensemble: Ensemble, n: int, *, seed: int = 0) -> npt.NDAr
         pick = int(rng.choice(pool))
         drawn += [int(x[pick] == s) for x, s in states]
         picks.append(int(valid[pick]))
-    ends = np.cumsum([len(a) for a in angles])
-    found = []
-    for pick in picks:
-        k = int(np.searchsorted(ends, pick, side="right"))
-        at = pick - (int(ends[k - 1]) if k else 0)
-        found.append(np.asarray(ensemble.segments[k][at : at + 1])[0])
-    return np.stack(found)
+    return pick_frames(ensemble.segments, np.array(picks))

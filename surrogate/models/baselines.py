@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import ClassVar, Self
 
 import numpy as np
-import numpy.typing as npt
 import torch
 from torch import Tensor, nn
 
@@ -18,11 +17,11 @@ from surrogate.models.architecture import Architecture, ModelConfig, Prepared, S
 from surrogate.models.propagator import Chunk, Molecule, Propagator
 from surrogate.models.weights import provenance_of, save_weights, training_domain
 from systems.errors import InputError
+from systems.scene import FloatArray
 
 N_KEPT_FRAMES = 4000
 # Modes that move less than this have no motion to model (a tenth of the frames' int16 unit).
 SMALLEST_DEVIATION_NM = 2e-5
-FloatArray = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True)

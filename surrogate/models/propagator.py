@@ -5,18 +5,13 @@ from __future__ import annotations
 import copy
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar, Self
 
 import torch
 from torch import Tensor, nn
 
 from systems.errors import InputError
-from systems.scene import ATOMIC_NUMBERS, PARTICLE
-
-if TYPE_CHECKING:
-    from typing import Self
-
-    from systems.scene import Scene
+from systems.scene import ATOMIC_NUMBERS, PARTICLE, Scene
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,6 +11,8 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import load
 
 from surrogate.data import TrainingFrames
 from surrogate.models.architecture import architecture
@@ -147,8 +149,6 @@ def read_header(path: str | Path) -> Header:
 
 
 def _header(path: Path) -> tuple[Header, dict[str, str]]:
-    from safetensors import SafetensorError, safe_open
-
     if not path.is_file():
         raise InputError(f"weights file {path} does not exist.")
     try:
@@ -165,9 +165,6 @@ def _header(path: Path) -> tuple[Header, dict[str, str]]:
 
 def load_weights(path: str | Path) -> Weights:
     """Load a weights file in evaluation mode. Raises InputError, WeightsError (damaged, non-finite, other shapes)."""
-    from safetensors import SafetensorError
-    from safetensors.torch import load
-
     path = Path(path)
     header, metadata = _header(path)
     data = path.read_bytes()

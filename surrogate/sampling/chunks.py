@@ -19,7 +19,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from time import perf_counter
-from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar, cast
+from typing import Any, NamedTuple, TypeVar, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -29,17 +29,14 @@ from surrogate.data import fitted_atoms
 from surrogate.models.layers import with_lean_parts
 from surrogate.models.potential import Potential
 from surrogate.models.propagator import Propagator, draw_noise
+from surrogate.models.weights import TrainingDomain, Weights
 from surrogate.sampling.config import RolloutConfig
 from surrogate.sampling.coupling import Coupling, PotentialChecks
 from surrogate.training.devices import choose_precision, keep_freed_memory, torch_threads
 from systems.chemistry import validity
-from systems.chemistry.geometry import superposition
+from systems.chemistry.geometry import FloatArray, superposition
 from systems.errors import InputError, SimulationError
 
-if TYPE_CHECKING:
-    from surrogate.models.weights import TrainingDomain, Weights
-
-FloatArray = npt.NDArray[np.floating[Any]]
 _Model = TypeVar("_Model", bound=Propagator)
 # Up to as many replicas one thread was faster than two, on a pair of hardware threads: products of few rows are too
 # small to be shared.
@@ -80,6 +77,8 @@ class ChunkSampler:
         # Chunks drawn, each row one, and the network evaluations they took together.
         self.drawn, self.evaluations = 0, 0.0
         self._model = with_lean_parts(with_bf16_weights(model) if self.precision.bf16 else model)
+        # Frames that a chunk is conditioned on, and those in it.
+        self.n_conditioning, self.n_new = model.n_conditioning, model.n_new
         self._molecule = model.featurise(template)
         self._fit = fitted_atoms(template)
         self._target = template.positions_nm - template.positions_nm[self._fit].mean(axis=0)
@@ -89,16 +88,6 @@ class ChunkSampler:
         other = copy.copy(self)
         other._model = cast(Potential, self._model).in_bath({"temperature_k": temperature_k, "ensemble": "nvt"})
         return other
-
-    @property
-    def n_conditioning(self) -> int:
-        """Frames that a chunk is conditioned on."""
-        return self._model.n_conditioning
-
-    @property
-    def n_new(self) -> int:
-        """Frames in a chunk."""
-        return self._model.n_new
 
     @property
     def evaluations_per_chunk(self) -> float:

@@ -4,7 +4,7 @@ how far a learned potential can be trusted at a frame."""
 from __future__ import annotations
 
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -13,15 +13,10 @@ import torch
 from surrogate.data import fitted_atoms
 from surrogate.models.potential import Potential
 from surrogate.models.propagator import Molecule
-from systems.chemistry.geometry import superposition
+from surrogate.models.weights import Weights
+from systems.chemistry.geometry import FloatArray, superposition
 from systems.errors import InputError, SurromdError
 from systems.units import whole_steps
-
-if TYPE_CHECKING:
-    from surrogate.models.weights import Weights
-
-
-FloatArray = npt.NDArray[np.floating[Any]]
 
 
 class Segment(NamedTuple):

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import pairwise
-from typing import TYPE_CHECKING, Any
+from typing import Any, NamedTuple
 
 import networkx as nx
 import numpy as np
@@ -20,7 +20,7 @@ from surrogate.models.peptides.chains import FREE_ENDS
 from surrogate.models.peptides.layout import PeptideConfig, chain_features, standard_peptide
 from surrogate.models.peptides.model import PeptideSlide
 from surrogate.models.potential import Potential
-from surrogate.models.propagator import draw_noise
+from surrogate.models.propagator import Propagator, draw_noise
 from surrogate.models.weights import Chemistry, TrainingDomain, Weights, load_weights, read_header
 from systems.chemistry.graph import match_atoms
 from systems.chemistry.validity import INVALID, NOT_FINITE, Geometry, check_frames, flag_names, geometry_from_scene
@@ -28,12 +28,8 @@ from systems.errors import InputError, OutOfDomainError
 from systems.scene import ATOMIC_NUMBERS, Scene
 from systems.units import format_time_ps
 
-if TYPE_CHECKING:
-    from surrogate.models.propagator import Propagator
 
-
-@dataclass(frozen=True)
-class Deviation:
+class Deviation(NamedTuple):
     """One way in which a scene leaves the training domain: `what` (molecule, start or temperature, of an unseen peptide
     also residues, size or ends), the `reason` in words, and whether the model can be run nevertheless (`forcible`)."""
 
@@ -232,8 +228,7 @@ def at_lag(weights: Weights, domain: TrainingDomain, lag_ps: float) -> Weights:
 TEMPERATURE_TOLERANCE_K = 0.5
 
 
-@dataclass(frozen=True, eq=False)
-class DomainMatch:
+class DomainMatch(NamedTuple):
     """How a scene fits weights. `order (n_atoms,)`: model atom k is scene atom `order[k]`; `domain`: training domain of
     the scene's molecule; `deviations`: those that `force` overruled; `seen`: whether the molecule was trained on;
     `nearness`: of an unseen peptide, how near to it training comes, in words."""
@@ -274,7 +269,7 @@ def match_domain(
     if known is None or match.seen:
         return match
     assert isinstance(weights.model, PainetPotential)
-    found = replace(match, deviations=(*match.deviations, *_doubts(scene, weights.model, known)))
+    found = match._replace(deviations=(*match.deviations, *_doubts(scene, weights.model, known)))
     return _refused(scene, found, weights.domain, name, force=force)
 
 

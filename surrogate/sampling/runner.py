@@ -7,16 +7,17 @@ import io
 import time
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 import torch
 
 from surrogate.models.potential import Potential
+from surrogate.models.weights import Weights
 from surrogate.sampling.chunks import (
     Chunk,
     ChunkSampler,
@@ -41,17 +42,13 @@ from systems.trajectory.base import TrajectoryWriter
 from systems.trajectory.codec import DIFFERENCE_COLUMN, open_trajectory
 from systems.units import format_time_ps, whole_steps
 
-if TYPE_CHECKING:
-    from surrogate.models.weights import Weights
-
 # Plan of a rollout: everything that is settled before the first chunk.
 
 # Farther from the origin float32 coordinates are too coarse for a molecule; frames are then written about it.
 _FAR_NM = 1000.0
 
 
-@dataclass(frozen=True, eq=False)
-class Plan:
+class Plan(NamedTuple):
     """What a rollout works with, settled before the first chunk."""
 
     scene: Scene

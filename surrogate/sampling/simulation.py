@@ -19,6 +19,7 @@ from surrogate.models.weights import Weights, load_weights
 from surrogate.sampling.chunks import ChunkSampler, noise_seed
 from surrogate.sampling.config import RolloutConfig
 from surrogate.sampling.domain import fit_weights, match_domain
+from systems.chemistry.geometry import FloatArray
 from systems.errors import InputError, SimulationError, first_line
 from systems.files.outside import UNREADABLE, arrays_in
 from systems.files.whole_file import create_whole
@@ -333,7 +334,6 @@ class SurrogateContext:
 
 # A learned potential as other programs take it: a function of positions, an OpenMM force, an ASE calculator.
 
-FloatArray = npt.NDArray[np.floating[Any]]
 # An Å in nm, an eV in kJ/mol (CODATA 2018).
 NM_PER_ANGSTROM = 0.1
 KJ_MOL_PER_EV = 96.48533212331

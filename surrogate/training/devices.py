@@ -8,8 +8,8 @@ import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from functools import cache
+from typing import NamedTuple
 
 import torch
 
@@ -28,8 +28,7 @@ _ROUNDS = 7
 _TIMED_STEPS, _STEPS_BETWEEN = 8, 500
 
 
-@dataclass(frozen=True)
-class Precision:
+class Precision(NamedTuple):
     """What a network is evaluated in, and why: `reason` goes into records and is said to the user."""
 
     bf16: bool

@@ -13,9 +13,11 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save_file
 from torch import Tensor, nn
 
 from surrogate.training import devices
@@ -148,8 +150,6 @@ def tensor_checksum(text: str, tensors: Mapping[str, torch.Tensor]) -> str:
 
 def save_tensors(path: Path, kind: str, record: dict[str, Any], tensors: Mapping[str, Tensor], **more: str) -> None:
     """Write tensors with their record, in the metadata under the name `kind`, whole or not at all."""
-    from safetensors.torch import save_file
-
     kept = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
     text = json.dumps(record)
     metadata = {**more, kind: text, "sha256": tensor_checksum(text, kept)}
@@ -158,8 +158,6 @@ def save_tensors(path: Path, kind: str, record: dict[str, Any], tensors: Mapping
 
 def load_tensors(path: Path, kind: str) -> tuple[dict[str, Any], dict[str, Tensor]]:
     """Return record and tensors as they were saved. Raises InputError for a file that is damaged or another's."""
-    from safetensors import SafetensorError, safe_open
-
     try:
         with safe_open(path, framework="pt") as handle:
             metadata = handle.metadata()
@@ -257,8 +255,7 @@ class Ema:
             p.copy_(self.shadow[name])
 
 
-@dataclass(frozen=True, eq=False)
-class Stage:
+class Stage(NamedTuple):
     """One stage of a training: the `module` that it trains, and how.
 
     `loss(generator)` draws its own batch from the generator, so that a resumed run draws what an uninterrupted one
@@ -272,8 +269,7 @@ class Stage:
     saves: bool = True
 
 
-@dataclass(frozen=True)
-class StagePlace:
+class StagePlace(NamedTuple):
     """Where a stage runs and writes: its resume `state` (.safetensors), the `log` of its curves (.csv), the device.
     `resume`: go on from the state, where there is one."""
 
@@ -373,12 +369,9 @@ def train_stages(
     if not resume:
         forget(log)
     for stage in stages:
-
-        def save(now_s: float) -> None:
-            write([*spent_s, now_s])
-
         place = StagePlace(out.with_name(f"{out.stem}.{stage.config.name}.train.safetensors"), log, device, resume)
-        spent_s.append(run_stage(stage, place, progress=progress, on_save=save if stage.saves else None))
+        on_save = (lambda now_s: write([*spent_s, now_s])) if stage.saves else None
+        spent_s.append(run_stage(stage, place, progress=progress, on_save=on_save))
     write(spent_s)
     forget()
 

@@ -5,12 +5,18 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from surrogate.models.architecture import shipped_weights
 from surrogate.verbs.options import PathLike
+from surrogate.verbs.run.run_record import RUN_NAME, RunResult
 from surrogate.verbs.simulate import describe_campaign
+from systems.chemistry.validity import INVALID
 from systems.errors import InputError, OutOfDomainError, first_line
 from systems.files.outside import UNREADABLE, content
 from systems.files.schema import parsed
+from systems.library.named_scenes import prepare
+from systems.trajectory.codec import open_trajectory
 from systems.units import format_time_ps
 
 UNSEEN = "a molecule that the weights were not trained on: compare with MD of it before you trust it"
@@ -36,8 +42,6 @@ def info(path: PathLike, scene: str | None = None) -> dict[str, Any]:
 
 def _run(folder: Path) -> dict[str, Any] | None:
     """Return what the folder of a run, or of runs of many molecules, says of itself; None for another folder."""
-    from surrogate.verbs.run.run_record import RUN_NAME, RunResult
-
     if (folder / RUN_NAME).is_file():
         return RunResult.of(folder)
     path = folder / "results.json"
@@ -56,7 +60,6 @@ def _run(folder: Path) -> dict[str, Any] | None:
 def _coverage(path: Path, scene: str) -> dict[str, Any]:
     from surrogate.models.weights import load_weights
     from surrogate.sampling.domain import match_domain
-    from systems.library.named_scenes import prepare
 
     weights, prepared = load_weights(path), prepare(scene)
     try:
@@ -85,11 +88,7 @@ def describe_file(path: Path) -> dict[str, Any]:
 
 
 def _trajectory(path: Path) -> dict[str, Any]:
-    import numpy as np
-
     from md_reference.run.run_summary import summary_lines
-    from systems.chemistry.validity import INVALID
-    from systems.trajectory.codec import open_trajectory
 
     with open_trajectory(path) as reader:
         times, flags, scene, record = reader.time_ps, reader.flags, reader.scene, dict(reader.record)

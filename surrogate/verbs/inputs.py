@@ -8,7 +8,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from glob import glob
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from md_reference.campaign.manifest import campaign_folder, campaign_trajectories
 from surrogate.verbs.options import Trajectories, tell
@@ -16,12 +16,11 @@ from systems.chemistry.graph import backbone_torsions, molecule_key
 from systems.errors import InputError
 from systems.library import named_scenes
 from systems.options import Preparation, part_of
+from systems.scene import Scene
 from systems.trajectory.checkpoint import checkpoint_path, frames_in
-from systems.trajectory.codec import WRITTEN
+from systems.trajectory.codec import WRITTEN, open_trajectory
 from systems.trajectory.companion_writer import refuse_other_companions
-
-if TYPE_CHECKING:
-    from systems.scene import Scene
+from systems.trajectory.joined import KEY
 
 
 def systems(name: str | None = None) -> list[dict[str, Any]]:
@@ -67,9 +66,8 @@ def prepare_scene(scene: str | Path | Scene, options: Preparation, *, quiet: boo
         return scene
     scene = str(scene)
     prepared = named_scenes.prepare(scene, options=part_of(options, Preparation))
-    if not quiet:
-        for line in prepared.provenance.get("repairs", []):
-            tell(scene, line)
+    for line in prepared.provenance.get("repairs", []):
+        tell(scene, line, quiet=quiet)
     return prepared
 
 
@@ -149,9 +147,6 @@ def find_trajectories(spec: Trajectories, *, verify: bool = False) -> list[Path]
 
 def _counted_once(found: list[Path]) -> list[Path]:
     """Return files without those that join others of them, which would be counted twice."""
-    from systems.trajectory.codec import open_trajectory
-    from systems.trajectory.joined import KEY
-
     kept = []
     for path in found:
         if path.with_name(f"{path.stem}_r0{path.suffix}") in found:

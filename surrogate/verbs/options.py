@@ -25,9 +25,10 @@ Trajectories = PathLike | Sequence[PathLike]
 said: ContextVar[Callable[[str], str]] = ContextVar("said", default=str)
 
 
-def tell(name: str, line: str) -> None:
-    """Write a line about a scene or a file to stderr."""
-    sys.stderr.write(f"{name}: {said.get()(line)}\n")
+def tell(name: str, line: str, *, quiet: bool = False) -> None:
+    """Write a line about a scene or a file to stderr, unless `quiet`."""
+    if not quiet:
+        sys.stderr.write(f"{name}: {said.get()(line)}\n")
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -3,15 +3,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import asdict, fields, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from md_reference.campaign.manifest import COMPLETE, FAILED, campaign_folder, read_manifest
+from md_reference.forces.spec import ForceFieldSpec, at_level
+from md_reference.run.config import MDConfig, resolve_settings, resolved, to_config
 from surrogate.models.architecture import weights_path
-from surrogate.progress import ProgressFn, progress_bar
+from surrogate.progress import progress_bar
 from surrogate.sampling.config import RolloutConfig
 from surrogate.verbs.inputs import check_outputs, prepare_scene, summarised_outputs
 from surrogate.verbs.options import (
@@ -22,15 +24,15 @@ from surrogate.verbs.options import (
     RolloutOptions,
     tell,
 )
+from systems.files.whole_file import replica_paths
 from systems.options import options_as_keywords, part_of
+from systems.scene import Scene
 from systems.trajectory.codec import WRITTEN
 from systems.trajectory.joined import join
 from systems.units import format_time_ps
 
 if TYPE_CHECKING:
     from md_reference.campaign.scheduler import CampaignProgress
-    from md_reference.run.simulate import MDConfig
-    from systems.scene import Scene
 
 
 @options_as_keywords(PlanOptions)
@@ -70,44 +72,44 @@ def reference(scene: str | Path | Scene, out: str | Path, options: ReferenceOpti
     """
     from md_reference.run.replicas import simulate_replicas
 
-    outs, joined = _outputs(Path(out), options)
+    files = _outputs(Path(out), options)
     molecule = prepare_scene(scene, options, quiet=options.quiet)
     molecule, config, protocol = resolve_run(molecule, options, {"time_ps": options.time_ps}, quiet=options.quiet)
     _ = config.n_frames, config.steps_per_frame  # uneven intervals are refused before anything runs
     if protocol and not options.quiet:
         tell(molecule.name, protocol)
-    with _written(f"OpenMM {molecule.name}", outs, config.save_every_ps, quiet=options.quiet) as progress:
-        written = simulate_replicas(
-            molecule,
-            config,
-            outs,
-            resume=options.resume,
-            overwrite=options.overwrite,
-            progress=progress,
-            announce=None if options.quiet else lambda said: tell(molecule.name, str(said)),
-        )
-    return [*written, *(join(written, path, overwrite=options.resume or options.overwrite) for path in joined)]
+    make = partial(simulate_replicas, molecule, config)
+    return _written("OpenMM", molecule.name, files, config.save_every_ps, options, make)
 
 
 def _outputs(out: Path, options: ReferenceOptions | RolloutOptions) -> tuple[list[Path], list[Path]]:
     """Return the files of replicas, and the one that joins them, if asked for; what cannot be meant is refused."""
-    from systems.files.whole_file import replica_paths
-
     outs = replica_paths(out, options.replicas)
     joined = [out] if options.join and len(outs) > 1 else []
     check_outputs([*outs, *joined], WRITTEN, resume=options.resume, overwrite=options.overwrite)
     return outs, joined
 
 
-@contextmanager
-def _written(label: str, outs: list[Path], ps_per_frame: float, *, quiet: bool) -> Iterator[ProgressFn | None]:
-    """Yield the progress bar of a verb that writes trajectories; on Ctrl-C it is said what is kept."""
-    label += f" x {len(outs)}" if len(outs) > 1 else ""
+def _written(
+    program: str, name: str, files: tuple[list[Path], list[Path]], ps_per_frame: float,
+    options: ReferenceOptions | RolloutOptions, make: Callable[..., list[Path]],
+) -> list[Path]:  # fmt: skip
+    """Return the trajectories of a scene that `make` writes, and the one that joins them, if asked for (`files`, of
+    `_outputs`); its progress is shown, and on Ctrl-C it is said what is kept."""
+    outs, joined = files
+    label = f"{program} {name}" + (f" x {len(outs)}" if len(outs) > 1 else "")
     with (
         summarised_outputs(outs, resumable="the same again with `resume=True` goes on"),
-        progress_bar(label, quiet=quiet, ps_per_frame=ps_per_frame) as progress,
+        progress_bar(label, quiet=options.quiet, ps_per_frame=ps_per_frame) as progress,
     ):
-        yield progress
+        written = make(
+            outs,
+            resume=options.resume,
+            overwrite=options.overwrite,
+            progress=progress,
+            announce=None if options.quiet else lambda said: tell(name, str(said)),
+        )
+    return [*written, *(join(written, path, overwrite=options.resume or options.overwrite) for path in joined)]
 
 
 def resolve_run(
@@ -117,8 +119,6 @@ def resolve_run(
     options those count that are settings of a run (MDConfig, ForceFieldSpec) or make its box. Raises InputError."""
     from md_reference.forces.forcefield import resolve
     from md_reference.forces.solvation import require_molecules, solvate_if_asked
-    from md_reference.forces.spec import ForceFieldSpec, at_level
-    from md_reference.run.config import MDConfig, resolve_settings, resolved, to_config
 
     given = asdict(options) | {"force_field": at_level(options.level, options.force_field)}
     settings_of_a_run = {f.name for kind in (MDConfig, ForceFieldSpec) for f in fields(kind)} - {"hydrogen_mass_da"}
@@ -139,11 +139,10 @@ def resolve_run(
         ionic_strength_molar=options.ionic_strength_molar,
     )  # fmt: skip
     config = resolved(scene, config)
-    if not quiet:
-        if scene is not dry:
-            tell(scene.name, scene.provenance["repairs"][-1])
-        for warning in config.force.warnings:
-            tell(scene.name, f"warning: {warning}")
+    if scene is not dry:
+        tell(scene.name, scene.provenance["repairs"][-1], quiet=quiet)
+    for warning in config.force.warnings:
+        tell(scene.name, f"warning: {warning}", quiet=quiet)
     return scene, config, protocol
 
 
@@ -172,7 +171,7 @@ def rollout(
     Raises OutOfDomainError for a molecule the weights do not cover, InputError, WeightsError, SimulationError (the
     guard cannot bring a chunk through), StorageError.
     """
-    outs, joined = _outputs(Path(out), options)
+    files = _outputs(Path(out), options)
     file = None if weights is None else weights_path(weights)
     molecule = prepare_scene(scene, options, quiet=options.quiet)
 
@@ -183,24 +182,14 @@ def rollout(
     config = part_of(options, RolloutConfig)
     if file is None:
         loaded, why = choose_weights(molecule, temperature_k=config.temperature_k)
-        if not options.quiet:
-            tell(molecule.name, why)
+        tell(molecule.name, why, quiet=options.quiet)
     else:
         loaded = load_weights(file)
     saved_ps = choose_lag(loaded, config.lag_ps, None) if config.save_every_ps is None else config.save_every_ps
     # The verb counts the frames of one replica; all advance together.
-    with _written(f"surrogate {molecule.name}", outs, saved_ps * len(outs), quiet=options.quiet) as progress:
-        written = roll(
-            molecule,
-            loaded,
-            outs,
-            config,
-            resume=options.resume,
-            overwrite=options.overwrite,
-            progress=progress,
-            announce=None if options.quiet else lambda line: tell(molecule.name, line),
-        )
-    return [*written, *(join(written, path, overwrite=options.resume or options.overwrite) for path in joined)]
+    ps_per_frame = saved_ps * len(files[0])
+    make = partial(roll, molecule, loaded, config=config)
+    return _written("surrogate", molecule.name, files, ps_per_frame, options, make)
 
 
 # ---- campaigns -----------------------------------------------------------------------------------------------------
@@ -233,10 +222,6 @@ def campaign(file: PathLike, out: PathLike | None = None, *, options: CampaignOp
     if manifest.counts().get(COMPLETE, 0) == len(manifest.runs):
         return describe_campaign(asked.folder)
 
-    def failed(name: str, reason: str) -> None:
-        if not options.quiet:
-            tell(name, reason)
-
     try:
         with (
             open_client(workers=options.workers, scheduler=options.scheduler, retries=asked.retries) as client,
@@ -249,7 +234,7 @@ def campaign(file: PathLike, out: PathLike | None = None, *, options: CampaignOp
                 if advance is not None:
                     advance(now.frames_done, max(now.frames_total, 1), note)
 
-            run_campaign(asked, client, progress=shown, failed=failed)
+            run_campaign(asked, client, progress=shown, failed=partial(tell, quiet=options.quiet))
     except KeyboardInterrupt as stop:
         if stop.args:
             raise

@@ -12,24 +12,27 @@ from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from surrogate.models.architecture import architecture, names, weights_path
+from md_reference.forces.spec import QUANTUM, at_level
+from surrogate.models.architecture import Trainer, TrainingRequest, architecture, names, toml_text, weights_path
 from surrogate.progress import progress_bar
 from surrogate.verbs.inputs import check_outputs, find_trajectories, prepare_scene
 from surrogate.verbs.options import PathLike, TrainOptions, Trajectories, WindowsOptions, tell
+from systems.chemistry.validity import flag_names
 from systems.errors import InputError, SurromdError
 from systems.files.whole_file import OutputLock, create_whole
 from systems.options import Preparation, options_as_keywords
 from systems.scene import Scene
+from systems.trajectory.codec import open_trajectory
 from systems.units import format_time_ps
 
 if TYPE_CHECKING:
     from surrogate.data import References
-    from surrogate.models.architecture import Trainer, TrainingRequest
     from surrogate.models.potential import Potential
     from surrogate.models.weights import Weights
 
@@ -104,27 +107,20 @@ def train(references: Trajectories, out: PathLike, options: TrainOptions) -> Pat
         if not options.quiet:
             tell(out.name, "this training is done, and nothing was changed; overwrite it to train anew")
         return out
-    if options.level is not None:
-        with OutputLock(out), progress_bar(f"training {out.stem}", quiet=options.quiet) as bar, _said_when_stopped(out):
-            written = learn_molecule(references, asked, options, _shown(bar))
-        _conclude(written, fitted=False, quiet=options.quiet)
-        return written
-    from surrogate.training.devices import choose_device
+    if options.level is None:
+        from surrogate.training.devices import choose_device
 
-    trainer, found, asked, lines = _plan(
-        references, options.validation, replace(asked, device=choose_device(options.device))
-    )
-    prepared = trainer.prepare(found, asked)
-    if not options.quiet:
+        asked = replace(asked, device=choose_device(options.device))
+        trainer, found, asked, lines = _plan(references, options.validation, asked)
+        prepared = trainer.prepare(found, asked)
         for line in lines:
-            tell(out.name, line)
-    with (
-        OutputLock(out),
-        progress_bar(f"training {prepared.scene}", quiet=options.quiet) as bar,
-        _said_when_stopped(out),
-    ):
-        written = prepared.start(_shown(bar))
-    _conclude(written, fitted=trainer.fitted, quiet=options.quiet)
+            tell(out.name, line, quiet=options.quiet)
+        name, fitted, start = prepared.scene, trainer.fitted, prepared.start
+    else:
+        name, fitted, start = out.stem, False, partial(learn_molecule, references, asked, options)
+    with OutputLock(out), progress_bar(f"training {name}", quiet=options.quiet) as bar, _said_when_stopped(out):
+        written = start(_shown(bar))
+    _conclude(written, fitted=fitted, quiet=options.quiet)
     return written
 
 
@@ -145,8 +141,6 @@ def explain_training(references: Trajectories, options: TrainOptions) -> str:
     Given as `config` of `train` it gives the same training. What was chosen stands at its head, with the reasons.
     Budget, seed and device belong to the command and are left out. Raises InputError, TrajectoryError.
     """
-    from surrogate.models.architecture import toml_text
-
     if options.level is not None:
         raise InputError("`explain` is for trainings on trajectories; leave `level` out.")
     asked = _asked(options, Path("explained.safetensors"))
@@ -159,8 +153,6 @@ def explain_training(references: Trajectories, options: TrainOptions) -> str:
 
 def _asked(options: TrainOptions, out: Path) -> TrainingRequest:
     """Return the request; `arch` is empty where nothing names one. Raises InputError for an unknown one."""
-    from surrogate.models.architecture import TrainingRequest
-
     arch = POTENTIAL if options.level is not None and options.arch in (None, "painet") else options.arch
     file = None if options.start_from is None else weights_path(options.start_from)
     if file is not None:
@@ -237,9 +229,8 @@ def _conclude(written: Path, *, fitted: bool, quiet: bool) -> None:
     except KeyboardInterrupt:
         raise KeyboardInterrupt(f"{written} is written; only the rollout that tries it was cut short") from None
     create_whole(written.with_suffix(".verdict.json"), json.dumps(asdict(verdict), indent=1) + "\n")
-    if not quiet:
-        for line in verdict.lines():
-            tell(written.name, line)
+    for line in verdict.lines():
+        tell(written.name, line, quiet=quiet)
 
 
 # ---- one molecule ----------------------------------------------------------------------------------------------------
@@ -255,8 +246,6 @@ def learn_molecule(
     for what the level of theory refuses.
     """
     began = time.monotonic()
-    from md_reference.forces.spec import QUANTUM, at_level
-
     if at_level(options.level, None) != QUANTUM:
         raise InputError(
             f"a level is worth learning where it is expensive; use `level='{QUANTUM}'`, or a reference of MD."
@@ -286,10 +275,9 @@ def learn_molecule(
             tell(request.out.name, f"{scene.name} ({scene.formula}) by {QUANTUM}; weights know this molecule alone")
         after_s = trial_s(PainetPotential(config), scene)
         out = trainer.learn(reference, request, advance, before_s=time.monotonic() - began, after_s=after_s)
-        if reference.n_rearranged and not options.quiet:
-            tell(
-                out.name, f"{reference.n_rearranged} states left out: they are another molecule, by bonds or handedness"
-            )
+        if n := reference.n_rearranged:
+            left_out = f"{n} states left out: they are another molecule, by bonds or handedness"
+            tell(out.name, left_out, quiet=options.quiet)
         return out
 
 
@@ -393,8 +381,6 @@ def _roll(weights: Weights) -> tuple[float, int, Counter[str], int, str]:
     frames of all, how many the guards caught and why, and what stopped the rollout."""
     from surrogate.sampling.chunks import caught
     from surrogate.sampling.runner import RolloutConfig, rollout
-    from systems.chemistry.validity import flag_names
-    from systems.trajectory.codec import open_trajectory
 
     time_ps, n_frames, n_caught, reasons, stopped = 0.0, 0, 0, Counter[str](), ""
     members, lag_ps = weights.domain.members, weights.domain.lag_ps

@@ -9,8 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -28,8 +27,7 @@ _MAX_STATES = 4
 _CLUSTERED_FRAMES = 10_000
 
 
-@dataclass(frozen=True, eq=False)
-class LagSums:
+class LagSums(NamedTuple):
     """Sums over pairs (t, t + lag) that start in a block, each `(n_blocks, n_lags)`, lag 0 first: products, first and
     second factor alone, how many pairs."""
 
@@ -163,8 +161,7 @@ def circular_mean(angles_rad: AnyFloat) -> float:
     return math.nan if not len(finite) else float(np.arctan2(np.sin(finite).mean(), np.cos(finite).mean()))
 
 
-@dataclass(frozen=True, eq=False)
-class Projection:
+class Projection(NamedTuple):
     """Slow coordinates of the reference: features `(n, k)` less `mean`, times `matrix` `(k, n_dimensions)`;
     `eigenvalues` `(n_dimensions,)` at the lag of the fit."""
 
@@ -238,8 +235,7 @@ def assign(clusters: Any, coordinates: Sequence[FloatArray]) -> list[IntArray]:
     return out
 
 
-@dataclass(frozen=True, eq=False)
-class MarkovModel:
+class MarkovModel(NamedTuple):
     """Microstates and metastable states of the reference.
 
     `centres` `(n_micro, n_dimensions)`; `state_of` `(n_micro,)` is the metastable state (0 the most populated) of each

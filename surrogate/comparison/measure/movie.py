@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import base64
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -28,8 +27,7 @@ _LARGEST = 32767
 _ROOM = 4.0
 
 
-@dataclass(frozen=True, eq=False)
-class Clip:
+class Clip(NamedTuple):
     """Frames of both trajectories at the same times: `time_ps (n,)`, coordinates `(n, n_shown, 3)` int16 in units of
     `Movie.scale_nm`, NOT_FINITE for a frame that cannot be drawn; validity flags `(n,)`; the candidate's chunk `(n,)`,
     None where its file marks none."""
@@ -56,8 +54,7 @@ class Clip:
         }
 
 
-@dataclass(frozen=True, eq=False)
-class Movie:
+class Movie(NamedTuple):
     """Clips of one candidate beside the reference: the elements shown, the bonds among them `(n_bonds, 2)`, nm per unit
     of the clips' coordinates."""
 
@@ -112,7 +109,7 @@ def make_movie(
 
 
 def pick_frames(segments: Sequence[Any], idx: IntArray) -> Frames:
-    """Return frames `idx` (sorted, counted through the segments in order) as `(len(idx), n_atoms, 3)` nm; consecutive
+    """Return frames `idx` (counted through the segments in order) as `(len(idx), n_atoms, 3)` nm; consecutive
     frames are read at once, so that segments may lie in a file."""
     starts = np.concatenate([[0], np.cumsum([len(s) for s in segments])])
     of_segment = np.searchsorted(starts, idx, side="right") - 1

@@ -39,8 +39,7 @@ class Piece(NamedTuple):
     block: int
 
 
-@dataclass(frozen=True)
-class Blocks:
+class Blocks(NamedTuple):
     """A division of all segments into blocks that are close to independent."""
 
     pieces: tuple[Piece, ...]

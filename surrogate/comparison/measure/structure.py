@@ -57,8 +57,7 @@ class Residue(NamedTuple):
     label: str
 
 
-@dataclass(frozen=True, eq=False)
-class Backbone:
+class Backbone(NamedTuple):
     """Backbone torsions of a scene: quadruples `(k, 4)`, their labels, and the residues that have both."""
 
     phi: IntArray
@@ -472,8 +471,7 @@ class Features(InSegments):
         return replace(self, **parts, series={family: cut(values) for family, values in self.series.items()})
 
 
-@dataclass(frozen=True, eq=False)
-class Baseline:
+class Baseline(NamedTuple):
     """What every frame of a comparison is measured by: torsions of the backbone, what valid frames look like, and what
     else is measured, `probes`, None for nothing."""
 

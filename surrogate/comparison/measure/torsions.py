@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
 import networkx as nx
@@ -121,8 +120,7 @@ def bond_label(scene: Scene, i: int, j: int) -> str:
     return f"{scene.atom_names[i]}-{scene.atom_names[j]} ({_where(scene, i, j)})"
 
 
-@dataclass(frozen=True, eq=False)
-class Wells:
+class Wells(NamedTuple):
     """States of one angle: `of_bin` `(72,)` holds the state of each bin of 5 degrees, -1 on a rim between two."""
 
     of_bin: IntArray

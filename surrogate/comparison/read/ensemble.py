@@ -25,7 +25,7 @@ from surrogate.comparison.read.stored_frames import (
     solute_atoms,
 )
 from systems.errors import InputError, OutOfDomainError, TrajectoryError, listed
-from systems.scene import Scene, part_of
+from systems.scene import FloatArray, IntArray, Scene, part_of
 from systems.trajectory.base import TrajectoryReader
 from systems.trajectory.codec import DIFFERENCE_COLUMN, open_trajectory, reweighting
 from systems.trajectory.joined import replicas_of
@@ -33,7 +33,6 @@ from systems.units import format_time_ps
 
 Frames = npt.NDArray[np.float32] | StoredFrames
 Flags = npt.NDArray[np.uint16]
-IntArray = npt.NDArray[np.int64]
 
 IN_MEMORY_BYTES = 128 * 2**20
 # How a note begins on files of runs that ended early.
@@ -41,7 +40,6 @@ STOPPED = "Stopped before the end"
 _LEAST_FRAMES = 10
 # Of a sample of frames, about as many numbers.
 _SAMPLED_VALUES = 20_000_000
-FloatArray = npt.NDArray[np.float64]
 
 # Fewer energies of a reference say nothing of how far its ensemble is the model's.
 _LEAST_ENERGIES = 10

@@ -11,7 +11,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import networkx as nx
@@ -21,11 +21,10 @@ import numpy.typing as npt
 from systems.chemistry.graph import bonded_graph, match_atoms
 from systems.chemistry.residues import is_water_name
 from systems.errors import OutOfDomainError
-from systems.scene import Scene, part_of
+from systems.scene import FloatArray, IntArray, Scene, part_of
 from systems.trajectory.base import TrajectoryReader
 
 Frames = npt.NDArray[np.float32]
-IntArray = npt.NDArray[np.int64]
 
 _PIECE_FRAMES = 8192
 _NEIGHBOURS = np.array(list(itertools.product((-1, 0, 1), repeat=3)), dtype=np.float64)
@@ -39,8 +38,7 @@ _FLAT = 0.45
 _PSEUDO_BOND_NM = 0.11
 
 
-@dataclass(frozen=True, eq=False)
-class BondTree:
+class BondTree(NamedTuple):
     """How to make molecules whole: bonds in breadth-first levels `(parents, children)`, and each molecule's atoms."""
 
     levels: tuple[tuple[IntArray, IntArray], ...]
@@ -189,7 +187,7 @@ def length_error_nm(grid_nm: float) -> float:
 
 def angle_variance(
     first_nm: npt.ArrayLike, second_nm: npt.ArrayLike, angle_rad: npt.ArrayLike, grid_nm: float
-) -> npt.NDArray[np.float64]:
+) -> FloatArray:
     """Return the variance that rounding gives bond angles, rad²: g²/12 times the squared gradient of the angle by all
     nine coordinates. Arms `(k,)` nm, angles `(k,)` rad; to first order."""
     a, b, angle = (np.asarray(v, dtype=np.float64) for v in (first_nm, second_nm, angle_rad))

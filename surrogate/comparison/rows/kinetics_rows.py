@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -236,8 +235,7 @@ def boundary_row(inputs: ComparisonInput) -> Measured:
     return Measured([row])
 
 
-@dataclass(frozen=True, eq=False)
-class _States:
+class _States(NamedTuple):
     """The frames of one sample in the states of the reference, and their sums per block at the model's lag; `role`:
     whose it is."""
 

@@ -148,8 +148,7 @@ class Row:
     time_scale: TimeScale = "slow"
 
 
-@dataclass(frozen=True, eq=False)
-class Sample:
+class Sample(NamedTuple):
     """One ensemble as it enters the statistics: features, their blocks, bootstrap weights `(n_draws, n_blocks)`. Tests
     use all blocks; what depends on the length itself (a histogram's distance, the replicate baseline) the first
     `n_equal` alone, which are as long as those of the other trajectories."""
@@ -406,8 +405,7 @@ def observable_row(
     )
 
 
-@dataclass(frozen=True, eq=False)
-class Means:
+class Means(NamedTuple):
     """The mean of every column `(k,)` and its bootstrap draws `(n_draws, k)`, from `n_blocks` blocks."""
 
     values: FloatArray

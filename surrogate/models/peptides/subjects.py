@@ -6,7 +6,7 @@ import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import cast
+from typing import NamedTuple, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -18,6 +18,7 @@ from surrogate.models.peptides.chains import FIRST_OF_SIDE_CHAIN, MOST_TORSIONS,
 from surrogate.models.peptides.layout import PeptideConfig
 from surrogate.models.peptides.model import PeptideSlide
 from systems.errors import InputError
+from systems.scene import FloatArray, IntArray
 
 # Weights that turn frames of short runs from chosen starts into equilibrium, by a reversible Markov model. Forward
 # windows need none, whatever they start from: a propagator is conditional. A window read backwards does: it starts
@@ -25,8 +26,6 @@ from systems.errors import InputError
 # likely equilibrium is to be where the run came from, there are as many as detailed balance asks for (Wu et al., Proc.
 # Natl. Acad. Sci. 113, E3221 (2016)).
 
-FloatArray = npt.NDArray[np.float64]
-IntArray = npt.NDArray[np.int64]
 
 _CELLS = 150
 _FRAMES_A_CELL = 30
@@ -373,8 +372,7 @@ _FOR_RARE = 0.6
 _POOL_SEED = 0
 
 
-@dataclass(frozen=True, eq=False)
-class StateWindows:
+class StateWindows(NamedTuple):
     """Windows of one sequence: frames `idx` (n, 1 + t), `times_ps` (n, t), how likely each is drawn, summed up (n,),
     and what it then counts for each torsion, `share` (n, n_residues, MOST_TORSIONS)."""
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from types import EllipsisType
-from typing import Any, cast
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 import torch
@@ -49,8 +49,7 @@ _PASSES = 4
 _RIDGE, _MOST = 0.3, 3.0
 
 
-@dataclass(frozen=True, eq=False)
-class Phi:
+class Phi(NamedTuple):
     """One phi of a peptide: its `residue`; frames well on its negative and on its positive side, `observed` (n,
     n_residues, n_slots) and `states` (n, n_residues, MOST_TORSIONS) of each; and how likely `positive` is beside the
     other."""

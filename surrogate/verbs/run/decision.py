@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Literal, NamedTuple
 
+from surrogate.comparison.md_answer import MODEL_ERROR
 from surrogate.verbs.run.rates import Rates
 from systems.errors import InputError
 from systems.units import format_time_ps, format_wall
@@ -116,8 +117,6 @@ def decide(
 def _shares(rates: Rates, way: Way, budget_s: float, left_s: float) -> dict[Stage, float]:
     """Return the shares of what the report leaves; a rollout that MD cannot better goes on until what it samples is
     known to half of what the model is off by."""
-    from surrogate.comparison.md_answer import MODEL_ERROR
-
     if way == "md" and rates.replicas == 1:
         return _BY_STAGES
     shares = PLANS[way].shares
@@ -189,7 +188,7 @@ def _interval(rates: Rates, way: Way, least_ps: float) -> float:
 
 
 def expected_errors(
-    rates: Rates, budget_s: float, relaxation_ps: float | None = None, model_error: float | None = None
+    rates: Rates, budget_s: float, relaxation_ps: float | None = None, model_error: float = MODEL_ERROR
 ) -> dict[str, float]:
     """Return the error to expect of the population of a state at the end of a budget, by each way to spend it.
 
@@ -200,9 +199,6 @@ def expected_errors(
     that the states may have; from frames of a rollout it is that rollout's own error, `model_error` (0.1 unless
     given) included.
     """
-    from surrogate.comparison.md_answer import MODEL_ERROR
-
-    model_error = MODEL_ERROR if model_error is None else model_error
     relaxation_ps = max(rates.relaxation_ps if relaxation_ps is None else relaxation_ps, 1e-3)
     seconds = (1.0 - _REPORT_SHARE) * budget_s
 

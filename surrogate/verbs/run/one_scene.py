@@ -12,9 +12,11 @@ from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import replace
 from datetime import UTC, datetime
+from importlib.metadata import version
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeVar
+from typing import TypeVar
 
+from md_reference.run.config import MDConfig
 from surrogate.progress import ProgressFn, progress_bar
 from surrogate.verbs.inputs import prepare_scene
 from surrogate.verbs.options import RunOptions, tell
@@ -37,11 +39,8 @@ from surrogate.verbs.simulate import resolve_run
 from systems.errors import InputError, SimulationError, SurromdError
 from systems.files.whole_file import OutputLock
 from systems.interrupts import deferred_interrupt, stop_when
+from systems.scene import Scene
 from systems.units import format_wall
-
-if TYPE_CHECKING:
-    from md_reference.run.config import MDConfig
-    from systems.scene import Scene
 
 T = TypeVar("T")
 LOG_NAME = "log.txt"
@@ -207,8 +206,7 @@ class _Run:
         """Write a line into the log, and show it."""
         with open(self._folder / LOG_NAME, "a", encoding="utf-8") as file:
             file.write(f"{datetime.now(UTC).isoformat(timespec='seconds')} {line}\n")
-        if not self._quiet:
-            tell(self._name, line)
+        tell(self._name, line, quiet=self._quiet)
 
     def before_stages(self, doing: str, work: Callable[[], T]) -> T:
         """Return what comes of work that is done before there are stages. Raises InputError where the budget ends
@@ -331,8 +329,6 @@ def _prepared(scene: str | Path | Scene, options: RunOptions) -> tuple[Scene, MD
 
 
 def _new_record(scene: str | Path | Scene, molecule: Scene, options: RunOptions) -> RunRecord:
-    from importlib.metadata import version
-
     import openmm
 
     programs = {"surromd": version("surromd"), "openmm": openmm.__version__, "python": sys.version.split()[0]}

@@ -11,13 +11,15 @@ from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from md_reference.forces.spec import QUANTUM, QUANTUM_SOLVENTS
+from md_reference.run.config import SIMD, MDConfig
+from surrogate.models.architecture import shipped_weights, weights_path
 from systems.errors import OutOfDomainError, SimulationError
+from systems.scene import Scene
 from systems.units import format_time_ps
 
 if TYPE_CHECKING:
-    from md_reference.run.config import MDConfig
     from surrogate.models.weights import Weights
-    from systems.scene import Scene
 
 # Rollouts side by side: one batch, which costs little more than one of them. Of a potential's, sixteen run at once on
 # each core; by torch a step of 32 is half as expensive for each as of 8.
@@ -99,8 +101,6 @@ def measure(scene: Scene, config: MDConfig, named: str | Path | None, cores: int
 
     Raises OutOfDomainError where weights are named and do not cover the scene, and what MD of it raises.
     """
-    from md_reference.forces.spec import QUANTUM, QUANTUM_SOLVENTS
-    from md_reference.run.config import SIMD
     from md_reference.run.machine import available_cores
     from md_reference.run.plan import make_plan
 
@@ -133,7 +133,6 @@ def _by_simd(rates: Rates, scene: Scene, config: MDConfig) -> Rates:
 
     Raises SimulationError where SIMD was asked for and cannot run the scene.
     """
-    from md_reference.run.config import SIMD
     from md_reference.run.plan import make_plan
     from md_reference.simd.force_field import n_replicas
 
@@ -168,7 +167,6 @@ def by_openmm(rates: Rates, scene: Scene, config: MDConfig, why: str) -> Rates:
 
 def rollout_rate(scene: Scene, weights: Weights, temperature_k: float, stretch: float, cores: int) -> Rolls:
     """Return how weights roll a scene that they cover, by a few chunks of it; `stretch`, `cores`: see `Rates`."""
-    from surrogate.models.architecture import shipped_weights
     from surrogate.models.potential import Potential
     from surrogate.sampling.domain import in_bath
     from surrogate.sampling.runner import RolloutConfig, rollout
@@ -216,7 +214,6 @@ def _slowest_ps(files: list[Path]) -> float:
 
 def _covering(scene: Scene, config: MDConfig, named: str | Path | None) -> tuple[Weights | None, str]:
     """Return the weights that cover the scene under these conditions, and why these or why none."""
-    from surrogate.models.architecture import weights_path
     from surrogate.models.weights import load_weights
     from surrogate.sampling.domain import check_conditions, choose_weights, match_domain
 

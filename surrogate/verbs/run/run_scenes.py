@@ -14,7 +14,7 @@ from dataclasses import dataclass, field, fields, replace
 from html import escape
 from importlib.resources import files
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 from urllib.parse import quote
 
 from md_reference.campaign.campaign_file import (
@@ -35,10 +35,8 @@ from systems.files.outside import content
 from systems.files.whole_file import create_whole
 from systems.interrupts import deferred_interrupt
 from systems.options import Preparation, options_as_keywords
+from systems.scene import Scene
 from systems.units import format_time_ps, format_wall
-
-if TYPE_CHECKING:
-    from systems.scene import Scene
 
 LIST_NAME, PAGE_NAME, RESULTS_NAME = "molecules.txt", "index.html", "results.json"
 _HEADS = (
@@ -175,9 +173,8 @@ def run_many(molecules: Molecules, folder: Path, options: RunOptions) -> dict[st
     _open_folder(molecules, folder, options)
     failed = dict(molecules.unreadable)
     lacking = [spec for spec in molecules.scenes if spec.name not in failed and not _is_done(folder / spec.name)]
-    if not options.quiet:
-        for name, reason in failed.items():
-            tell(name, reason)
+    for name, reason in failed.items():
+        tell(name, reason, quiet=options.quiet)
     if lacking:
         with open_client(workers=options.workers, scheduler=options.scheduler) as client:
             each = replace(options, budget_s=_share_s(len(lacking), client, options.budget_s))
@@ -259,8 +256,7 @@ def _hand_out(specs: list[SceneSpec], folder: Path, options: RunOptions, client:
                 del waiting[name]
                 if (reason := _reason(done)) and not asked_to_stop():
                     failed[name] = reason
-                    if not options.quiet:
-                        tell(name, reason)
+                    tell(name, reason, quiet=options.quiet)
             # Workers that hear nothing for a minute stop by themselves.
             client.run(poll, token, on_error="ignore")
             if advance is not None:

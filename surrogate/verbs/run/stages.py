@@ -11,8 +11,14 @@ from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
+import numpy as np
+import numpy.typing as npt
+
+from md_reference.run.config import MDConfig
+from surrogate.comparison.md_answer import Answer, frames_over_states, md_answer
+from surrogate.comparison.read.ensemble import STOPPED, load_ensemble
 from surrogate.comparison.verdict import LEAST_SAMPLES
 from surrogate.verbs.compare import compare
 from surrogate.verbs.inputs import summarised_outputs
@@ -23,19 +29,16 @@ from surrogate.verbs.run.run_record import ANSWER_NAME, REPORT_NAME, Outcome, Ru
 from surrogate.verbs.simulate import rollout
 from surrogate.verbs.train import train
 from systems.errors import InputError, SimulationError
-from systems.files.whole_file import create_whole
+from systems.files.whole_file import create_whole, replica_paths
 from systems.options import Preparation
+from systems.scene import Scene
+from systems.trajectory.checkpoint import checkpoint_path, frames_in
+from systems.trajectory.codec import write_weights
 from systems.units import format_time_ps, format_wall
 
 if TYPE_CHECKING:
-    import numpy as np
-    import numpy.typing as npt
-
-    from md_reference.run.config import MDConfig
     from surrogate.comparison.comparison import Comparison, Evaluation, Summary
     from surrogate.comparison.equivalent_time import EquivalentTime
-    from surrogate.comparison.md_answer import Answer
-    from systems.scene import Scene
 
 # A run may turn out faster than measured, and have the machine for itself: the clock, not its length, ends it.
 _AMPLE = 2.0
@@ -56,8 +59,7 @@ UNWEIGHTED = (
 WEIGHTS_NAME = "weights.safetensors"
 
 
-@dataclass(frozen=True, eq=False)
-class Site:
+class Site(NamedTuple):
     """Where a run takes place: its folder, the scene, the settings of its MD, and what was asked for."""
 
     folder: Path
@@ -88,8 +90,6 @@ def _md_stage(name: Stage, place: str, seed: int) -> StageOf:
     """
 
     def outs(site: Site, replicas: int, mark: str = "") -> list[Path]:
-        from systems.files.whole_file import replica_paths
-
         return replica_paths(site.folder / f"{place}{mark}.{site.options.format if name == 'md' else 'h5'}", replicas)
 
     def by_now(site: Site, record: RunRecord) -> list[Path]:
@@ -145,9 +145,6 @@ def _starts(site: Site, record: RunRecord, config: MDConfig, files: list[Path]) 
     """Return where replicas of MD begin, and their settings: at frames of the rollout, drawn over all its states, where
     there is one, else at states of hot MD, which takes a small part of their time."""
     from md_reference.run.starts import HOT_PS, frames_as_starts, many_starts
-    from surrogate.comparison.md_answer import frames_over_states
-    from surrogate.comparison.read.ensemble import load_ensemble
-    from systems.trajectory.checkpoint import checkpoint_path
 
     rates, decision = _rates_and_decision(record)
     if config.starts == "one" or len(files) < 2:
@@ -189,8 +186,6 @@ def md_options(options: RunOptions, **more: Any) -> ReferenceOptions:
 
 def _with_frames(folder: Path, paths: list[Path]) -> tuple[str, ...]:
     """Return the files that can be evaluated: one frame tells no interval."""
-    from systems.trajectory.checkpoint import frames_in
-
     return tuple(str(path.relative_to(folder)) for path in paths if frames_in(path) > 1)
 
 
@@ -259,8 +254,6 @@ def _roll(site: Site, record: RunRecord) -> RunRecord:
 
 
 def _rolled(site: Site, record: RunRecord) -> RunRecord | None:
-    from systems.files.whole_file import replica_paths
-
     rates, _ = _rates_and_decision(record)
     if rates.rolls is None:
         return None
@@ -406,18 +399,12 @@ def costs_of(record: RunRecord, comparison: Comparison, held_ps: float) -> Costs
 
 def notable(notes: tuple[str, ...]) -> tuple[str, ...]:
     """Return a comparison's notes without the one that files were stopped: the clock ends a stage, as is planned."""
-    from surrogate.comparison.read.ensemble import STOPPED
-
     return tuple(note for note in notes if not note.startswith(STOPPED))
 
 
 def answer_of(site: Site, record: RunRecord) -> Answer | None:
     """Return what all MD of a run says of equilibrium, written into its folder, each frame's weight into its file; None
     where it tells nothing."""
-    from surrogate.comparison.md_answer import md_answer
-    from surrogate.comparison.read.ensemble import load_ensemble
-    from systems.trajectory.codec import write_weights
-
     is_md = _rates_and_decision(record)[1].way == "md"
     files = [site.folder / file for file in (*(record.trajectory if is_md else ()), *record.held_out)]
     rolled = None if is_md else load_ensemble([site.folder / file for file in record.trajectory])
