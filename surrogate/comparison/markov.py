@@ -59,7 +59,8 @@ class Equilibrium:
     `method`: how it was found; `lag_frames`: of the Markov model; `timescales`, `timescale_errors` `(k,)` in frames,
     descending; `flat`: whether the slowest is the same at a longer lag; `ck_error`: the largest difference between
     predicted and observed probabilities to be where one was (Chapman-Kolmogorov), `ck_holds` whether that is within
-    errors; `crossings`: how often the slowest process was seen, in the rarer direction. `populations` `(n_micro,)`, 0
+    errors; `crossings`: how often the slowest process that populations depend on was seen, in the rarer direction: not
+    that between a replica and its image, which are as likely. `populations` `(n_micro,)`, 0
     outside the connected set; `draws` `(n_draws, n_micro)` of a bootstrap over replicas, whose multiplicities are
     `resampled` `(n_draws, n_units)`; `unit_of` says for each unit which replica and which frames it is. `weights`: of
     every frame, one array a replica, mean 1 over all. `unconnected`: what has no weight. `n_own`: how many replicas are
@@ -146,7 +147,7 @@ def equilibrium(
     lost = any(u.fate != "left and never entered" for u in unconnected)
     ck_error, ck_holds = _chapman_kolmogorov(model, micro, units, resampled[:20])
     found = Equilibrium(
-        "Markov model", model.lag, model.times, errors, flat, ck_error, ck_holds, model.crossings(micro[:own]),
+        "Markov model", model.lag, model.times, errors, flat, ck_error, ck_holds, model.crossings(micro, own),
         model.populations, draws, resampled, tuple(units), (), unconnected, own,
     )  # fmt: skip
     if n_frames.min() >= _OUTLASTS * slowest and not lost and found.crossings > 0:
@@ -256,14 +257,13 @@ def reversible(counts: FloatArray) -> tuple[FloatArray, FloatArray] | None:
 
 
 def _timescales(matrix: FloatArray, stationary: FloatArray, lag: int, most: int = 5) -> tuple[FloatArray, FloatArray]:
-    """Return the slowest timescales, descending, and the eigenfunction of the first."""
+    """Return the slowest timescales, descending, and their eigenfunctions `(n_states, k)`."""
     root = np.sqrt(np.maximum(stationary, 1e-300))
     values, vectors = np.linalg.eigh(0.5 * ((root[:, None] * matrix / root) + (root[:, None] * matrix / root).T))
     order = np.argsort(-values)[1 : 1 + most]
     with np.errstate(divide="ignore"):
         times = -lag / np.log(np.clip(values[order], 1e-6, 1 - 1e-12))
-    first = vectors[:, order[0]] / root if len(order) else np.zeros(len(stationary))
-    return times, first
+    return times, vectors[:, order] / root[:, None]
 
 
 class _Model:
@@ -277,18 +277,25 @@ class _Model:
         if fitted is None:
             raise InputError(f"no reversible Markov model fits transitions {lag} frames apart; give longer replicas.")
         self.matrix, self.stationary, self.kept = fitted
-        self.times, self.first = _timescales(self.matrix, self.stationary, lag)
+        self.times, functions = _timescales(self.matrix, self.stationary, lag)
         self.populations = np.zeros(n)
         self.populations[self.kept] = self.stationary
-        # Which side of the slowest process a microstate is on, -1 outside the connected set.
-        self.side = np.full(n, -1)
-        self.side[self.kept] = self.first > 0
+        # Which side of each slow process a microstate is on, -1 outside the connected set and for no state.
+        self.sides = np.full((max(functions.shape[1], 1), n + 1), -1)
+        self.sides[:, self.kept] = functions.T > 0 if functions.size else 0
+        self.side = self.sides[0, :n]
 
-    def crossings(self, micro: list[IntArray]) -> int:
-        """Return how often the slowest process is seen in its rarer direction, at steps of the lag."""
+    def crossings(self, micro: list[IntArray], own: int) -> int:
+        """Return how often the slowest process is seen in its rarer direction, at steps of the lag, in the `own` first:
+        of those that do not tell these from the images behind them."""
+        of = self.sides[0]
+        for of in self.sides:
+            alike = [(of[m] == of[image]).mean() for m, image in zip(micro[:own], micro[own:], strict=False)]
+            if not alike or np.mean(alike) > 0.5:
+                break
         ways = np.zeros(2, dtype=int)
-        for m in micro:
-            side = np.append(self.side, -1)[m[:: self.lag]]
+        for m in micro[:own]:
+            side = of[m[:: self.lag]]
             side = side[side >= 0]
             for way in (0, 1):
                 ways[way] += int(((side[:-1] == way) & (side[1:] == 1 - way)).sum())

@@ -78,7 +78,8 @@ class StateEnergy:
 class Answer:
     """What MD says of a molecule. `weights`: of every frame, an array a replica; `lag_ps` between frames;
     `timescales_ps` with `timescale_errors_ps`, descending; `states`; `maps`: for each residue the free energy in kJ/mol
-    `(36, 36)` over φ and ψ, from -180°, infinity where MD never was; `missing`: what it cannot tell."""
+    `(36, 36)` over φ and ψ, from -180°, infinity where MD never was; `has_images`: whether each replica counts with its
+    mirror image; `missing`: what it cannot tell."""
 
     method: str
     n_replicas: int
@@ -88,6 +89,7 @@ class Answer:
     timescales_ps: tuple[float, ...]
     timescale_errors_ps: tuple[float, ...]
     tests: str
+    has_images: bool
     holds: bool
     states: tuple[StateEnergy, ...]
     maps: dict[str, FloatArray]
@@ -131,6 +133,7 @@ class Answer:
             error = f" ± {format_time_ps(self.timescale_errors_ps[0], 2)}" if self.timescale_errors_ps else ""
             slow = f"; the slowest process takes {format_time_ps(self.timescales_ps[0], 2)}{error}"
         length = f"{self.n_replicas} replicas of {format_time_ps(self.replica_ps, 2)}"
+        length += ", each with its mirror image" * self.has_images
         if self.is_by_surrogate:
             not_yet = f" and off by up to {100 * max(s.error for s in weighted):.2g} %"
         else:
@@ -272,7 +275,8 @@ def md_answer(md: Ensemble, temperature_k: float, *, surrogate: Ensemble | None 
         model_lag_ps=found.lag_frames * ps,
         timescales_ps=tuple((found.timescales * ps).tolist()),
         timescale_errors_ps=tuple((found.timescale_errors * ps).tolist()),
-        tests=_tests(found, ps) + ", each replica with its mirror image" * (found.n_own < len(micro)),
+        tests=_tests(found, ps),
+        has_images=found.n_own < len(micro),
         holds=found.holds,
         states=tuple(states),
         maps=_maps(torsions, angles, found.weights, temperature_k),

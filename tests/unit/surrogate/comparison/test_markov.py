@@ -139,6 +139,22 @@ def test_states_that_are_too_coarse_are_found_out() -> None:
     assert equilibrium(hidden).timescales[0] < 10.0  # nothing tells of what states hide: why features come from TICA
 
 
+def test_what_images_are_known_to_balance_need_not_be_seen_often() -> None:
+    """Two states of either hand, that turn into each other often and change hands hardly ever."""
+    matrix = np.array(
+        [[0.95, 0.05, 0.0, 0.0], [0.1, 0.899, 0.001, 0.0], [0.0, 0.001, 0.899, 0.1], [0.0, 0.0, 0.05, 0.95]]
+    )
+    micro = run(matrix, [0, 1] * 6, 200, 1)
+    alone, both = equilibrium(micro), equilibrium([*micro, *(3 - m for m in micro)], n_own=len(micro))
+    assert alone.unconnected and not both.unconnected, "negative control"
+    assert both.holds and both.crossings > 50 and both.n_own == len(micro)
+    assert np.abs(both.populations - np.array([1 / 3, 1 / 6, 1 / 6, 1 / 3])).max() < 0.04
+    assert (both.draws[:, 0] - both.draws[:, 3]).std() < 0.02
+    # Frames of MD have these populations by their weights.
+    weighted = np.bincount(np.concatenate(micro), np.concatenate(both.weights[: both.n_own]), minlength=4)
+    assert weighted / weighted.sum() == pytest.approx(both.populations, abs=1e-6)
+
+
 def test_nothing_to_count_is_one_line() -> None:
     with pytest.raises(InputError, match="longer replicas"):
         equilibrium([np.full(10, -1)])

@@ -143,7 +143,7 @@ def answer(**more: Any) -> Answer:
     given: dict[str, Any] = {
         "method": "Markov model", "n_replicas": 32, "replica_ps": 375.0, "lag_ps": 1.0, "model_lag_ps": 10.0,
         "timescales_ps": (900.0,), "timescale_errors_ps": (90.0,), "tests": "a Markov model", "holds": True,
-        "states": (state(), state(state="β")), "maps": {}, "missing": (), "weights": (),
+        "has_images": False, "states": (state(), state(state="β")), "maps": {}, "missing": (), "weights": (),
     }  # fmt: skip
     return Answer(**(given | more))
 
