@@ -9,7 +9,9 @@ Nothing is invented: what transitions do not connect in both directions gets no 
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Literal, NamedTuple
@@ -136,11 +138,18 @@ def equilibrium(
     units = _units(micro, lags[-1], -(-_LEAST_UNITS // own))
     n_units = len(units) // images
     resampled = np.tile(rng.multinomial(n_units, np.full(n_units, 1.0 / n_units), size=_N_DRAWS), images)
-    models = [_Model(micro, units, n_micro, n) for n in lags]
+    models = []
+    for n in lags:
+        with suppress(InputError):
+            models.append(_Model(micro, units, n_micro, n))
+    if not models:
+        raise InputError("no reversible Markov model fits the transitions; give longer replicas.")
     chosen, flat = _choose(models, resampled)
     model = models[chosen]
     draws, times = _draw(model, resampled)
-    errors = np.nanstd(times, axis=0, ddof=1) if len(times) > 1 else np.full(len(model.times), np.nan)
+    with warnings.catch_warnings():  # of a process that is in no draw
+        warnings.simplefilter("ignore", RuntimeWarning)
+        errors = np.nanstd(times, axis=0, ddof=1)
     slowest = float(model.times[0]) if len(model.times) else 0.0
     n_frames = np.array([len(m) for m in micro])
     unconnected = _unconnected(model, micro)
@@ -231,9 +240,10 @@ def reversible(counts: FloatArray) -> tuple[FloatArray, FloatArray] | None:
     both, out = counts + counts.T, counts.sum(1)
 
     def step(y: FloatArray) -> FloatArray:
-        w = out * np.exp(-y)
-        z = (both / (w[:, None] + w[None])).sum(1)
-        return np.asarray(np.log(z / z.sum()))
+        with np.errstate(all="ignore"):  # a jump too far gives no numbers
+            w = out * np.exp(-y)
+            z = (both / (w[:, None] + w[None])).sum(1)
+            return np.asarray(np.log(z / z.sum()))
 
     y = np.log(both.sum(1) / both.sum())
     for _ in range(_MOST_STEPS):
@@ -275,7 +285,7 @@ class _Model:
         self.counts = self.by_unit.sum(0)
         fitted = _fit(self.counts)
         if fitted is None:
-            raise InputError(f"no reversible Markov model fits transitions {lag} frames apart; give longer replicas.")
+            raise InputError(f"no reversible Markov model fits transitions {lag} frames apart.")
         self.matrix, self.stationary, self.kept = fitted
         self.times, functions = _timescales(self.matrix, self.stationary, lag)
         self.populations = np.zeros(n)
@@ -310,6 +320,7 @@ def _draw(model: _Model, resampled: IntArray) -> tuple[FloatArray, FloatArray]:
         drawn = np.zeros(model.n)
         if fitted is None:
             populations.append(model.populations)
+            times.append(np.full(len(model.times), np.nan))
             continue
         matrix, stationary, kept = fitted
         drawn[kept] = stationary
@@ -336,10 +347,16 @@ def _choose(models: list[_Model], resampled: IntArray) -> tuple[int, bool]:
         if not slowest[k][0] >= math.log(model.lag):
             return k, True
         added = [float(later[0] - slowest[k][0]) for later in slowest[k + 1 :]]
-        errors = [float(np.nanstd(later - drawn[k])) for later in drawn[k + 1 :]]
+        errors = [_finite_std(later, drawn[k]) for later in drawn[k + 1 :]]
         if all(a <= max(_FLAT, 2.0 * e) for a, e in zip(added, errors, strict=True)):
             return k, True
     return len(models) - 1, False
+
+
+def _finite_std(a: FloatArray, b: FloatArray) -> float:
+    """Return the standard deviation of a - b where both are numbers."""
+    both = np.isfinite(a) & np.isfinite(b)
+    return float((a[both] - b[both]).std()) if both.sum() > 1 else 0.0
 
 
 def _log_slowest(times: FloatArray) -> FloatArray:

@@ -3,6 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from surrogate.comparison import markov
 from surrogate.comparison.markov import equilibrium, reversible
 from systems.errors import InputError
 
@@ -153,6 +154,28 @@ def test_what_images_are_known_to_balance_need_not_be_seen_often() -> None:
     # Frames of MD have these populations by their weights.
     weighted = np.bincount(np.concatenate(micro), np.concatenate(both.weights[: both.n_own]), minlength=4)
     assert weighted / weighted.sum() == pytest.approx(both.populations, abs=1e-6)
+
+
+@pytest.mark.parametrize("every", [7, 2, 1])
+def test_what_fits_nothing_is_left_out(
+    every: int, monkeypatch: pytest.MonkeyPatch, recwarn: pytest.WarningsRecorder
+) -> None:
+    """Lags or resampled replicas of which no matrix is found: by others the answer stands, by none it is a line."""
+    calls, fit = [0], markov._fit
+
+    def sometimes(counts: np.ndarray) -> object:
+        calls[0] += 1
+        return None if calls[0] % every == 0 else fit(counts)
+
+    monkeypatch.setattr(markov, "_fit", sometimes)
+    micro = run(chain(), [0, 1, 2, 2] * 8, 300)
+    if every == 1:
+        with pytest.raises(InputError, match="no reversible Markov model fits"):
+            equilibrium(micro)
+        return
+    found = equilibrium(micro)
+    assert np.isfinite(found.timescale_errors[0]) and np.abs(found.populations - POPULATIONS).max() < 0.2
+    assert not recwarn.list
 
 
 def test_nothing_to_count_is_one_line() -> None:
