@@ -73,6 +73,8 @@ WAYS = {"run": "surromd run", "one": "MD from one start", "many": "MD from many 
 HALVES = "reference's halves"
 KELVIN, SEED, EVERY_PS, BINS, LEFT_OUT_PS = 300.0, 5_000, 10.0, 50, 5_000.0
 ENOUGH_R_HAT, HELD = 1.05, 0.95
+# MD from one start that ends before this share of the time that a budget buys is none of that budget's.
+LONG_ENOUGH = 0.9
 # A rollout is no longer: what it is off by then is the model's.
 ROLLED_MINUTES = 1.0
 
@@ -335,7 +337,9 @@ def errors_of_ways(result: RunResult, minutes: float, place: Path, ref: LongMD) 
     else:
         found["run"] = ref.errors(ref.load(result.md), [sm.frame_weights(f) for f in result.md] if answer else None)
     if one := finished(place / "one"):
-        found["one"] = ref.errors(ref.load(one, md_ps))
+        md = ref.load(one, md_ps)
+        if len(md.segments[0]) * md.lag_ps > LONG_ENOUGH * md_ps:
+            found["one"] = ref.errors(md)
     if md_ps < 0.5 * ref.answer.replica_ps:
         found["many"] = ref.errors_of_beginning(md_ps)
     if rates["rolls"] and (rolled := finished(place / "rollout")):
