@@ -91,9 +91,8 @@ def build_system(scene: Scene, spec: ForceFieldSpec, *, rough: bool = False) -> 
 
     Particles are the scene's atoms in its order; virtual sites (OPC) come after them. The OBC2 term is OpenMM's
     GBSAOBCForce, several times faster than the CustomGBForce of implicit/obc2.xml, with the same energies. `rough`: see
-    `gaff.entry`. Raises
-    PreparationError when the force field has no parameters for a residue or a molecule, or does not suit the scene's
-    cell.
+    `gaff.entry`. Raises PreparationError when the force field has no parameters for a residue or a molecule, or does
+    not suit the scene's cell.
     """
     spec = resolve(scene, spec)
     if spec.force_field == MODEL:

@@ -298,7 +298,6 @@ class _Model:
     def crossings(self, micro: list[IntArray], own: int) -> int:
         """Return how often the slowest process is seen in its rarer direction, at steps of the lag, in the `own` first:
         of those that do not tell these from the images behind them."""
-        of = self.sides[0]
         for of in self.sides:
             alike = [(of[m] == of[image]).mean() for m, image in zip(micro[:own], micro[own:], strict=False)]
             if not alike or np.mean(alike) > 0.5:

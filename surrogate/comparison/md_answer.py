@@ -26,7 +26,7 @@ from surrogate.comparison.read.ensemble import Ensemble
 from systems.chemistry.geometry import column_blocks, torsion_angle
 from systems.chemistry.validity import INVALID
 from systems.errors import InputError
-from systems.scene import Scene, neighbours_of
+from systems.scene import Scene
 from systems.units import GAS_CONSTANT_KJ_MOL_K, format_time_ps
 
 _TICA_LAG_PS = 10.0
@@ -226,11 +226,12 @@ class _Torsions:
 def _is_its_mirror_image(scene: Scene) -> bool:
     """Return whether MD of a molecule reaches the mirror images of its frames, atom by atom: nothing keeps handedness,
     not even atoms with like neighbours, such as isopropyl's."""
-    heavy = [[k for k in near if scene.elements[k] != "H"] for near in neighbours_of(scene.bonds, scene.n_atoms)]
-    degree = np.bincount(scene.bonds.ravel(), minlength=scene.n_atoms)
-    # Amines turn inside out; sulfoxides and phosphines do not.
-    keeps = 3 + np.isin(scene.elements, ["C", "N", "O"])
-    return not any(len(near) >= 3 and degree[k] >= keeps[k] for k, near in enumerate(heavy))
+    for element, near in zip(scene.elements, scene.neighbours(), strict=True):
+        # Amines turn inside out; sulfoxides and phosphines do not.
+        least = 4 if element in ("C", "N", "O") else 3
+        if len(near) >= least and sum(scene.elements[k] != "H" for k in near) >= 3:
+            return False
+    return True
 
 
 def md_answer(md: Ensemble, temperature_k: float, *, surrogate: Ensemble | None = None, seed: int = 0) -> Answer:

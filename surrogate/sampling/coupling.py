@@ -130,11 +130,11 @@ class PotentialChecks:
         # Infinity where training did not measure them.
         error, spread = (float(weights.provenance.get(name, np.inf)) for name in ("energy_mae", "energy_spread"))
         self._wrong_kj_mol, self._unsure_kj_mol = WRONG_TIMES * error, UNSURE_TIMES * spread
-        # Members that never saw the molecule have each a zero of energy of their own for it.
-        start = torch.tensor(weights.domain.scene.positions_nm, dtype=torch.float64)
-        with torch.no_grad():
-            zero = self._model.energies(start[None], self._molecule)
-        self._zero_kj_mol = torch.zeros_like(zero) if weights.domain.limits is not None else zero
+        self._zero_kj_mol = torch.zeros(())
+        if weights.domain.limits is None:  # members that never saw the molecule have each a zero of their own for it
+            start = torch.tensor(weights.domain.scene.positions_nm[None], dtype=torch.float64)
+            with torch.no_grad():
+                self._zero_kj_mol = self._model.energies(start, self._molecule)
 
     def unsure(self, frames_nm: FloatArray) -> npt.NDArray[np.bool_]:
         """Frames `(b, n, n_atoms, 3)` nm -> `(b, n)`; frames that are not finite are the other checks' to find."""

@@ -22,7 +22,7 @@ from surrogate.models.peptides.model import PeptideSlide
 from surrogate.models.potential import Potential
 from surrogate.models.propagator import Propagator, draw_noise
 from surrogate.models.weights import Chemistry, TrainingDomain, Weights, load_weights, read_header
-from systems.chemistry.graph import match_atoms
+from systems.chemistry.graph import bonded_graph, match_atoms
 from systems.chemistry.validity import INVALID, NOT_FINITE, Geometry, check_frames, flag_names, geometry_from_scene
 from systems.errors import InputError, OutOfDomainError
 from systems.scene import ATOMIC_NUMBERS, Scene
@@ -134,14 +134,12 @@ def cover_molecule(scene: Scene, domain: TrainingDomain, known: Chemistry) -> tu
     atoms can. A valid frame has the bond lengths of the scene."""
     charge = int(scene.formal_charges.sum())
     electrons = sum(ATOMIC_NUMBERS.get(e, 0) for e in scene.elements) - charge
-    graph = nx.Graph(scene.bonds.tolist())
-    graph.add_nodes_from(range(scene.n_atoms))
     least, most = known.charges
     reasons = [
         f"holds {', '.join(others)}" if (others := sorted(set(scene.elements) - set(known.elements))) else "",
         f"bears a charge of {charge:+d} e" if not least <= charge <= most else "",
         "has an odd number of electrons" if electrons % 2 else "",
-        f"is {n} molecules" if (n := nx.number_connected_components(graph)) > 1 else "",
+        f"is {n} molecules" if (n := nx.number_connected_components(bonded_graph(scene))) > 1 else "",
     ]
     found = [Deviation("molecule", " and ".join(filter(None, reasons)), forcible=False)] if any(reasons) else []
     if scene.n_atoms > known.n_atoms:

@@ -430,11 +430,11 @@ def summary(rows: list[dict[str, Any]]) -> list[str]:
             f"populations no worse than the best way's by more than the stated error: {sum(near)} of {len(full)}",
         ]
     for word in ("right", "not converged", "wrong"):
-        found.append(f"verdict {word}: {sum(r['verdict'] == word for r in rows)} of {len(rows)}")
+        found.append(f"verdict {word}: {sum(r['verdict'] == word for r in sure)} of {len(sure)} with such a reference")
     answered = [r for r in sure if r["verdict"] != "not converged"]
     held, total = (sum(r[key] for r in answered) for key in ("intervals held", "of"))
     found.append(f"intervals of populations that hold, of converged answers: {held} of {total}")
-    equivalent_times = [r["equivalent MD time held"] for r in rows if r.get("equivalent MD time held") is not None]
+    equivalent_times = [r["equivalent MD time held"] for r in sure if r["equivalent MD time held"] is not None]
     found.append(f"intervals of equivalent MD time that hold: {sum(equivalent_times)} of {len(equivalent_times)}")
     return found
 

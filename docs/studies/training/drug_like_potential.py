@@ -28,6 +28,7 @@ from torch import Tensor
 
 import surrogate as sm
 from surrogate.models.painet.energy import NO_WALL_NM, PainetPotential, PotentialConfig, Topology
+from surrogate.models.painet.potential_trainer import conditions_of
 from surrogate.models.propagator import Molecule
 from surrogate.models.weights import Chemistry, TrainingDomain, Weights, load_weights, provenance_of, save_weights
 from surrogate.sampling.domain import disagreement
@@ -183,18 +184,13 @@ def train(given: argparse.Namespace) -> None:
 def domain_of(learned: list[Labelled], config: PotentialConfig) -> TrainingDomain:
     """Return what the weights cover, with nothing trusted yet."""
     scene = prepare(f"smiles:{learned[0].entry.smiles}")
-    conditions = {
-        "force_field": "gfn2-xtb", "solvent": "vacuum", "temperature_k": config.temperature_k,
-        "friction_per_ps": config.friction_per_ps, "timestep_ps": config.timestep_ps,
-        "hydrogen_mass_da": config.hydrogen_mass_da, "constrain_hydrogens": config.constrain_hydrogens,
-    }  # fmt: skip
     numbers = torch.cat([one.topology.present for one in learned]).tolist()
     elements = tuple(symbol for symbol, number in ATOMIC_NUMBERS.items() if number in numbers)
     charges = [one.entry.charge for one in learned]
     # Nothing is trusted until it is measured how far.
     known = Chemistry(elements, max(one.entry.n_atoms for one in learned), (min(charges), max(charges)), 0.0)
     geometry = geometry_from_scene(scene).to_dict()
-    return TrainingDomain(scene, config.lag_ps, conditions, geometry, transferable=True, chemistry=known)
+    return TrainingDomain(scene, config.lag_ps, conditions_of(config), geometry, transferable=True, chemistry=known)
 
 
 def print_errors(given: argparse.Namespace) -> None:

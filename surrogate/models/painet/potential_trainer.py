@@ -79,14 +79,18 @@ class Samples:
         return Samples(empty, np.zeros(0), empty, np.zeros(0, dtype=bool))
 
 
-def domain_of(scene: Scene, samples: Samples, moving: list[Any], config: PotentialConfig) -> TrainingDomain:
-    """Return what the weights cover: what frames look like by the reference's quieter samples, and how far they move
-    from one to the next by runs of cheap MD, `moving` (n, n_atoms, 3) each, hot ones among them."""
-    conditions = {
+def conditions_of(config: PotentialConfig) -> dict[str, Any]:
+    """Return the conditions under which weights of these settings stand for MD at the level they learned."""
+    return {
         "force_field": "gfn2-xtb", "solvent": "vacuum", "temperature_k": config.temperature_k,
         "friction_per_ps": config.friction_per_ps, "timestep_ps": config.timestep_ps,
         "hydrogen_mass_da": config.hydrogen_mass_da, "constrain_hydrogens": config.constrain_hydrogens,
     }  # fmt: skip
+
+
+def domain_of(scene: Scene, samples: Samples, moving: list[Any], config: PotentialConfig) -> TrainingDomain:
+    """Return what the weights cover: what frames look like by the reference's quieter samples, and how far they move
+    from one to the next by runs of cheap MD, `moving` (n, n_atoms, 3) each, hot ones among them."""
     quiet = samples.positions_nm[np.argsort(samples.energies_kj_mol)[: max(2, len(samples) // 2)]]
     looks = limits_from_frames(scene, quiet, quiet)
     before, after = (np.concatenate([run[part] for run in moving]) for part in (slice(-1), slice(1, None)))
@@ -96,7 +100,7 @@ def domain_of(scene: Scene, samples: Samples, moving: list[Any], config: Potenti
     jumps = {key: getattr(moves, key) for key in ("jump_idx", "jump_max_nm", "jump_min_nm")}
     limits = replace(looks, **jumps, drift_max_nm=WIDENING * float(drift_nm))
     geometry = geometry_from_frames(scene, quiet)
-    return TrainingDomain(scene, config.lag_ps, conditions, geometry.to_dict(), limits.to_dict(), ())
+    return TrainingDomain(scene, config.lag_ps, conditions_of(config), geometry.to_dict(), limits.to_dict(), ())
 
 
 # The share of the budget in which states are labelled; what is missing then is labelled at once, unless a resumption
