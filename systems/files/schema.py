@@ -95,6 +95,8 @@ def _hints(cls: type[Any]) -> dict[str, Any]:
 def fitted(value: Any, hint: Any, where: str) -> Any:
     """Return a value as the annotation `hint` wants it. Raises ValueError where it does not fit; see `built`."""
     origin, args = get_origin(hint), get_args(hint)
+    if hasattr(origin, "__value__"):  # an alias by `type`, as NumPy's NDArray is from 2.5 on
+        return fitted(value, origin.__value__[args], where)
     if hint is Any:
         return value
     if is_typeddict(hint):

@@ -19,20 +19,35 @@ import argparse
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import torch
-from drug_like_states import Entry, read_list
+from drug_like_states import Entry, read_compact, read_list
+from recorded import Recorded
 from torch import Tensor
+from torch.nn import functional as F
 
 import surrogate as sm
-from surrogate.models.painet.energy import NO_WALL_NM, PainetPotential, PotentialConfig, Topology
+from surrogate.models.painet.energy import (
+    LEAST_NM,
+    N_SHELLS,
+    NO_WALL_NM,
+    WALL,
+    Edges,
+    EnergyNetwork,
+    PainetPotential,
+    PotentialConfig,
+    Topology,
+    measure_edges,
+)
+from surrogate.models.painet.model import dense_mean
 from surrogate.models.painet.potential_trainer import conditions_of
 from surrogate.models.propagator import Molecule
 from surrogate.models.weights import Chemistry, TrainingDomain, Weights, load_weights, provenance_of, save_weights
 from surrogate.sampling.domain import disagreement
-from surrogate.training.devices import torch_threads
+from surrogate.training.devices import choose_device, torch_threads
 from surrogate.training.loop import Stage, StageConfig, train_stages
 from systems.chemistry.validity import INVALID, geometry_from_scene
 from systems.errors import SimulationError, SurromdError
@@ -44,8 +59,10 @@ from systems.units import parse_time_ps, parse_wall_s
 # States so far above a molecule's lowest, for each atom, are left out: no MD comes there.
 HIGHEST_KJ_MOL = 12.0
 BAG, SEED = 0.75, 7
+SUMS = ("n_scalars", "n_vectors", "n_tensors")
 KJ_MOL_NM_PER_KCAL_MOL_A, KJ_MOL_PER_KCAL = 41.84, 4.184
-VALIDATED = 40
+# Molecules are batched with others of about their size, in so many arrays of one shape.
+N_BUCKETS, HELD_STATES = 6, 24
 # Every so many-th molecule of the training list is kept for `trust`.
 ASIDE_EVERY, ASIDE = 42, "aside"
 REPLICAS, KEPT_WHOLE = 16, 0.96
@@ -62,8 +79,8 @@ class Labelled:
     forces: Tensor
 
 
-def load(folder: Path, splits: Sequence[str], most: int | None = None) -> list[Labelled]:
-    """Return the molecules of these splits that have been labelled."""
+def load(folder: Path, splits: Sequence[str], most: int | None = None, states: int | None = None) -> list[Labelled]:
+    """Return the molecules of these splits that have been labelled, at most so many, with at most so many states."""
     found = []
     for number, entry in enumerate(read_list()):
         path = folder / f"{number:04d}.npz"
@@ -76,7 +93,8 @@ def load(folder: Path, splits: Sequence[str], most: int | None = None) -> list[L
             kept = energies < HIGHEST_KJ_MOL * len(numbers)
             molecule = Molecule(numbers, torch.ones(len(numbers)), torch.from_numpy(data["bonds"]),
                                 charge=int(data["charges"].sum()))  # fmt: skip
-            arrays = (data["positions_nm"][kept], energies[kept].astype(np.float32), data["forces_kj_mol_nm"][kept])
+            x, forces = (read_compact(data, name)[kept] for name in ("positions_nm", "forces_kj_mol_nm"))
+            arrays = (a[:states] for a in (x, energies[kept].astype(np.float32), forces))
         if kept.sum() >= 8:
             found.append(Labelled(entry, Topology.of(molecule), *map(torch.from_numpy, arrays)))
         if most and len(found) >= most:
@@ -84,41 +102,190 @@ def load(folder: Path, splits: Sequence[str], most: int | None = None) -> list[L
     return found
 
 
-class Learner:
-    """`loss` learns from some molecules a step, `errors` measures on molecules that are held out."""
+class Blocks(Edges):
+    """Edges of several molecules side by side, each in a block of as many places: every place with every one of its
+    block. A place that holds no atom is to all as it is to itself, infinitely far."""
 
-    def __init__(
-        self, model: PainetPotential, learned: list[Labelled], held: list[Labelled], molecules: int, rows: int
-    ) -> None:
-        self.model, self.learned, self.held, self.molecules, self.rows = model, learned, held, molecules, rows
+    @property
+    def by_block(self) -> tuple[int, int]:
+        return (-1, self.n_atoms)
+
+    def sent(self, values: Tensor) -> Tensor:
+        blocks = values.unflatten(0, self.by_block)
+        return blocks[:, None].expand(-1, self.n_atoms, *blocks.shape[1:]).flatten(0, 2)
+
+    def apart_nm(self, positions_nm: Tensor) -> Tensor:
+        x = positions_nm.unflatten(0, self.by_block)
+        return (x[:, :, None] - x[:, None]).flatten(0, 2)
+
+    def sum(self, values: Tensor) -> Tensor:
+        return values.unflatten(0, self.by_block).sum(1)
+
+    def by_atom(self, shapes: Tensor) -> Tensor:
+        return shapes.unflatten(0, self.by_block).permute(0, 2, 3, 1).contiguous()
+
+    def sum_of_products(self, laid: Tensor, values: Tensor) -> Tensor:
+        return laid @ values.unflatten(0, self.by_block).transpose(1, 2)
+
+
+@dataclass(frozen=True, eq=False)
+class Bucket:
+    """Molecules of about one size in arrays of one shape, on the device that trains: `elements` (n, places), zero where
+    there is no atom, `charge` (n,), `shell` (n, places, places), `bonded` of ones where atoms share a bond; `x` nm and
+    `forces` (n, states, places, 3), `energies` (n, states), of which the first `n_states` (n,) count; `bags` (n,
+    members), ones where a member learns from the molecule."""
+
+    elements: Tensor
+    charge: Tensor
+    shell: Tensor
+    bonded: Tensor
+    x: Tensor
+    forces: Tensor
+    energies: Tensor
+    n_states: Tensor
+    bags: Tensor
+
+    @staticmethod
+    def of(learned: list[Labelled], bags: Tensor, device: torch.device) -> Bucket:
+        n, places = len(learned), max(one.entry.n_atoms for one in learned)
+        states = max(len(one.energies) for one in learned)
+        elements, shell = torch.zeros(n, places, dtype=torch.int64), torch.full((n, places, places), N_SHELLS - 1)
+        bonded, energies = torch.zeros(n, places, places), torch.zeros(n, states)
+        x, forces = torch.zeros(n, states, places, 3), torch.zeros(n, states, places, 3)
+        for k, one in enumerate(learned):
+            n_states, n_atoms, _ = one.positions_nm.shape
+            elements[k, :n_atoms] = one.topology.molecule.elements
+            bonded[k, *one.topology.bonds] = 1.0
+            for (i, j), apart in one.topology.shells.items():
+                shell[k, [i, j], [j, i]] = apart
+            x[k, :n_states, :n_atoms], forces[k, :n_states, :n_atoms] = one.positions_nm, one.forces
+            energies[k, :n_states] = one.energies - one.energies.mean()
+        counts = torch.tensor([len(one.energies) for one in learned])
+        charge = torch.tensor([float(one.topology.molecule.charge) for one in learned])
+        return Bucket(*(t.to(device) for t in (elements, charge, shell, bonded, x, forces, energies, counts, bags)))
+
+
+def buckets_of(learned: list[Labelled], bags: Tensor, device: torch.device) -> list[Bucket]:
+    """Return the molecules by size."""
+    order = sorted(range(len(learned)), key=lambda k: learned[k].entry.n_atoms)
+    parts = np.array_split(order, min(N_BUCKETS, len(order)))
+    return [Bucket.of([learned[k] for k in part], bags[part], device) for part in parts]
+
+
+def energies_of_many(network: EnergyNetwork, bucket: Bucket, chosen: Tensor, x: Tensor) -> Tensor:
+    """Frames `x` (molecules, rows, places, 3) nm of the `chosen` molecules of a bucket -> the members' energies
+    (molecules, rows, n_members), as `EnergyNetwork` computes them of one molecule."""
+    c, (many, rows, places, _) = network.config, x.shape
+    elements, shell = bucket.elements[chosen], bucket.shell[chosen]
+    real = elements > 0
+    z = network.embed_type(elements) + bucket.charge[chosen, None, None] * network.embed_type.weight[0]
+    for round_ in network.surroundings:
+        z = z + round_(torch.cat([z, bucket.bonded[chosen] @ z], dim=-1))
+    of_shell = network.of_shell(shell)
+    ends = (z[:, :, None] + of_shell).flatten(0, 2), z[:, None].expand_as(of_shell).flatten(0, 2)
+    of_edge = network.of_pair(torch.cat(ends, dim=-1))
+    place = torch.arange(places, device=x.device)
+    apart = (place[:, None] != place) & real[:, :, None] & real[:, None]
+    receiver = torch.zeros_like(shell).flatten()
+    edges = Blocks(receiver, apart.long().flatten(), shell.flatten(), places, True)
+    at = x.transpose(1, 2).flatten(0, 1)
+    seen = measure_edges(at, edges, c.n_radial, c.cutoff_nm, x.dtype)
+    weight = real / real.sum(1, keepdim=True)
+    moved = 10.0 * (x - torch.einsum("bn,brnd->brd", weight, x)[:, :, None])
+    h = z.flatten(0, 1)[:, None].expand(-1, rows, -1)
+    carried = None
+    types = elements[:, :, None], elements[:, None]
+    for look, step in zip(network.looks, network.steps, strict=True):
+        h = look(h, carried, seen, edges, look.weights(of_edge))
+        phi, psi = (m[:, *types].movedim(0, 1)[:, None] * real[:, None, None, None] for m in step.type_matrices())
+        of_atom = h.unflatten(0, (many, places)).transpose(1, 2)
+        q, k, v = step.qkv(of_atom).unflatten(-1, (3, c.n_heads, -1)).permute(3, 0, 1, 4, 2, 5)
+        q, k = F.normalize(q, dim=-1), F.normalize(k, dim=-1)
+        v = torch.cat([v, moved[:, :, None].expand(-1, -1, c.n_heads, -1, -1)], dim=-1)
+        own, means = dense_mean(q, k, v, phi, psi).split((c.head_dim, 3), dim=-1)
+        new = (1.0 - c.step) * of_atom + c.step * step.out(own.transpose(2, 3).flatten(-2))
+        h = new.transpose(1, 2).flatten(0, 1)
+        carried = (means - moved[:, :, None]).permute(0, 3, 1, 4, 2).flatten(0, 1)
+    both = real[:, None, None, :, None] & real[:, None, None, None]
+    s = 2.0 - 2.0 * q @ q.transpose(-1, -2)
+    latent = (both * (phi + psi) * s - both * 0.25 * psi * s.square()).sum((-1, -2)) / real.sum(1)[:, None, None] ** 2
+    site = network.site(h).unflatten(0, (many, places)) * real[..., None, None]
+    table = network.table(of_edge).unflatten(-1, (c.n_radial, -1))
+    paired = torch.bmm(seen.radial, table).unflatten(0, (many, -1)).sum(1)
+    walls = shell, *(t.expand_as(shell) for t in types)
+    near = torch.relu(1.0 - seen.distance_nm / network.nearest_nm[walls].flatten()[:, None].clamp(min=LEAST_NM))
+    far = torch.where(apart, network.farthest_nm[walls], torch.inf).flatten()
+    held = (near.pow(3) + torch.relu(seen.distance_nm / far[:, None] - 1.0).pow(3)).unflatten(0, (many, -1)).sum(1)
+    return site.sum(1) + 0.5 * paired + latent @ network.latent + WALL * held[..., None]
+
+
+class Learner:
+    """`loss` learns from some molecules a step, of about one size; `errors` measures on molecules that are held out."""
+
+    def __init__(self, model: PainetPotential, learned: list[Labelled], held: list[Labelled], molecules: int, rows: int,
+                 device: torch.device) -> None:  # fmt: skip
+        self.model, self.molecules, self.rows = model, molecules, rows
+        self.recorded: dict[int, Recorded] = {}
         draw = torch.rand(len(learned), model.config.n_members, generator=torch.Generator().manual_seed(SEED))
-        self.bags = ((draw < BAG) | (draw == draw.amin(1, keepdim=True))).float()
+        bags = ((draw < BAG) | (draw == draw.amin(1, keepdim=True))).float()
+        self.buckets, self.held = buckets_of(learned, bags, device), buckets_of(held, torch.ones(len(held), 1), device)
         forces = torch.cat([s.forces.square().mean((1, 2)) for s in learned])
-        model.energy_scale_kj_mol.fill_(0.1 * float(forces.median().sqrt()))
+        self.scale = 0.1 * float(forces.median().sqrt())
+        model.energy_scale_kj_mol.fill_(self.scale)
         model.energy_offset_kj_mol.zero_()
 
     def loss(self, generator: torch.Generator) -> tuple[Tensor, dict[str, Tensor]]:
         """Mean length of the error of an atom's force, and mean square error of energies for each atom."""
-        scale = float(self.model.energy_scale_kj_mol)
-        force, energy = [], []
-        for k in torch.randint(len(self.learned), (self.molecules,), generator=generator).tolist():
-            one = self.learned[k]
-            pick = torch.randint(len(one.energies), (self.rows,), generator=generator)
-            member = int(torch.multinomial(self.bags[k], 1, generator=generator))
-            at = one.positions_nm[pick].requires_grad_(True)
-            found = self.model.members(at, one.topology)[:, member]
-            (gradient,) = torch.autograd.grad(found.sum(), at, create_graph=True)
-            wrong = (gradient + one.forces[pick]) / (10.0 * scale)
-            force.append((wrong.square().sum(-1) + 1e-8).sqrt().mean())
-            off = (found - one.energies[pick]) / scale
-            energy.append((off - off.mean()).square().mean() / at.shape[1] ** 0.5)
-        of_forces, of_energies = torch.stack(force).mean(), torch.stack(energy).mean()
-        return of_forces + 0.1 * of_energies, {"force": of_forces.detach(), "energy": of_energies.detach()}
+        place = int(torch.randint(len(self.buckets), (), generator=generator))
+        bucket = self.buckets[place]
+        u = torch.rand(self.molecules, self.rows + 2, generator=generator).to(bucket.charge)
+        chosen = (u[:, 0] * len(bucket.charge)).long()
+        # Of the members that learn from a molecule, one.
+        bags = bucket.bags[chosen].cumsum(1)
+        member = (bags <= (u[:, 1:2] * bags[:, -1:]).floor()).sum(1)
+        drawn = chosen, (u[:, 2:] * bucket.n_states[chosen, None]).long(), member
+        if u.device.type == "cpu":
+            found = self.parts(bucket, self.model, *drawn)
+        else:
+            if place not in self.recorded:
+                self.recorded[place] = Recorded(self.model, partial(self.parts, bucket), drawn)
+            found = self.recorded[place](*drawn)
+        return found.sum(), dict(zip(("force", "energy"), found.detach(), strict=True))
+
+    def parts(self, bucket: Bucket, model: PainetPotential, chosen: Tensor, picked: Tensor, member: Tensor) -> Tensor:
+        """Return the losses of forces and of energies (2,) for the states `picked` (n, rows) of the molecules `chosen`
+        (n,), from which a `member` (n,) learns."""
+        at = bucket.x[chosen[:, None], picked].requires_grad_(True)
+        of_members = energies_of_many(model.network, bucket, chosen, at)
+        found = self.scale * of_members.gather(2, member[:, None, None].expand(-1, self.rows, 1))[..., 0]
+        (gradient,) = torch.autograd.grad(found.sum(), at, create_graph=True)
+        wrong = (gradient + bucket.forces[chosen[:, None], picked]) / (10.0 * self.scale)
+        real = (bucket.elements[chosen] > 0)[:, None]
+        of_forces = ((wrong.square().sum(-1) + 1e-8).sqrt() * real).sum() / real.sum() / self.rows
+        off = (found - bucket.energies[chosen[:, None], picked]) / self.scale
+        of_energies = ((off - off.mean(1, keepdim=True)).square().mean(1) / real.sum((1, 2)) ** 0.5).mean()
+        return torch.stack([of_forces, 0.1 * of_energies])
 
     def errors(self) -> dict[str, float]:
-        found = np.array([errors_of(self.model, one)[:2] for one in self.held[:VALIDATED]])
+        found = torch.cat([errors_of_many(self.model, bucket) for bucket in self.held])
         force, energy = found.mean(0).tolist()
         return {"validation_force_kcal": force, "validation_energy_kcal_atom": energy}
+
+
+def errors_of_many(model: PainetPotential, bucket: Bucket, most: int = HELD_STATES) -> Tensor:
+    """Return by molecule the first two of `errors_of`: (n, 2)."""
+    found = []
+    for chosen in torch.arange(len(bucket.charge), device=bucket.x.device).split(8):
+        picked = torch.arange(most, device=bucket.x.device) % bucket.n_states[chosen, None]
+        at = bucket.x[chosen[:, None], picked].requires_grad_(True)
+        energies = float(model.energy_scale_kj_mol) * energies_of_many(model.network, bucket, chosen, at).mean(-1)
+        (gradient,) = torch.autograd.grad(energies.sum(), at)
+        n_atoms = (bucket.elements[chosen] > 0).sum(1)
+        wrong = (gradient + bucket.forces[chosen[:, None], picked]).abs().sum((1, 2, 3)) / (3.0 * most * n_atoms)
+        off = energies.detach() - bucket.energies[chosen[:, None], picked]
+        uneven = (off - off.mean(1, keepdim=True)).abs().mean(1) / n_atoms
+        found.append(torch.stack([wrong / KJ_MOL_NM_PER_KCAL_MOL_A, uneven / KJ_MOL_PER_KCAL], dim=-1))
+    return torch.cat(found).cpu()
 
 
 def errors_of(model: PainetPotential, one: Labelled, most: int = 24) -> tuple[float, float, float]:
@@ -156,13 +323,17 @@ def set_walls(model: PainetPotential, learned: list[Labelled]) -> None:
 
 def train(given: argparse.Namespace) -> None:
     torch.manual_seed(SEED)
-    config = PotentialConfig(width=given.width, n_steps=given.steps_of_network, n_members=4)
+    sums = dict(zip(SUMS, given.sums, strict=True))
+    config = PotentialConfig(width=given.width, n_steps=given.steps_of_network, **sums)
     model = PainetPotential(config)
-    learned, held = load(given.folder, ["train"], given.most), load(given.folder, ["test"])
+    learned, held = load(given.folder, ["train"], given.most, given.states), load(given.folder, ["test"])
     said(f"{len(learned)} molecules with {sum(len(s.energies) for s in learned):,} states, {len(held)} held out; "
          f"{sum(p.numel() for p in model.parameters()):,} parameters")  # fmt: skip
-    learner = Learner(model, learned, held, given.molecules, given.rows)
     set_walls(model, learned)
+    device = torch.device(choose_device(given.device))
+    torch.set_float32_matmul_precision("high")
+    learner = Learner(model.to(device), learned, held, given.molecules, given.rows, device)
+    domain = load_weights(given.like).domain if given.like else domain_of(learned, config)
     stage = StageConfig("potential", given.molecules * given.rows, 2e-3, given.budget, matrix_rate=0.01, seed=SEED,
                         bf16=False, validate_every_s=given.validate)  # fmt: skip
 
@@ -170,14 +341,14 @@ def train(given: argparse.Namespace) -> None:
         sources = [{"file": "docs/studies/training/drug_like.tsv", "n_frames": sum(len(s.energies) for s in learned)}]
         found = {"seed": SEED, "training_s": round(sum(spent_s), 1), **learner.errors()}
         provenance = provenance_of({"reference_ns": 0.0, "sources": sources}, found)
-        save_weights(given.out, model, domain_of(learned, config), provenance)
+        save_weights(given.out, model, domain, provenance)
 
     def progress(name: str, share: float, metrics: dict[str, float]) -> None:
         if metrics:
             said(f"{100 * share:.1f} %: " + ", ".join(f"{k} {v:.4g}" for k, v in metrics.items()))
 
     with torch_threads(given.threads):
-        train_stages([Stage(model, stage, learner.loss, learner.errors)], given.out, write, device=torch.device("cpu"),
+        train_stages([Stage(model, stage, learner.loss, learner.errors)], given.out, write, device=device,
                      resume=given.resume, progress=progress)  # fmt: skip
 
 
@@ -289,12 +460,16 @@ def main() -> None:
     trusting.add_argument("--time", type=lambda text: parse_time_ps(text, "--time"), default=250.0)
     training.add_argument("--width", type=int, default=96)
     training.add_argument("--steps-of-network", type=int, default=2)
+    training.add_argument("--sums", type=int, nargs=3, default=[16, 8, 4], help="scalars, vectors, tensors of a look")
+    training.add_argument("--device", default="auto")
+    training.add_argument("--like", type=Path, help="weights whose domain these get, where RDKit and OpenMM are not")
     training.add_argument("-o", "--out", type=Path, required=True)
     training.add_argument("--budget", type=lambda text: parse_wall_s(text, "--budget"), required=True)
     training.add_argument("--resume", action="store_true")
     training.add_argument("--molecules", type=int, default=4)
     training.add_argument("--rows", type=int, default=24)
     training.add_argument("--most", type=int, help="molecules to train on")
+    training.add_argument("--states", type=int, help="states of each")
     training.add_argument("--threads", type=int, default=1)
     training.add_argument("--validate", type=float, default=300.0)
     given = parser.parse_args()

