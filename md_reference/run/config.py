@@ -175,7 +175,7 @@ def resolve_settings(
         decisive.pop("solvent", None)
     own = defaults()
     if given.get("force_field") == QUANTUM:
-        own |= _of_quantum(decisive | dict(given))
+        own |= _of_quantum(scene, decisive | dict(given))
         decisive.pop("equilibrate_ps", None)
     settings = own | decisive | dict(given)
     if settings["timestep_ps"] > LONGEST_FLEXIBLE_STEP_PS and "constrain_hydrogens" not in given:
@@ -198,12 +198,23 @@ def to_config(values: Mapping[str, Any], *, seed: int) -> MDConfig:
     return MDConfig(**own, seed=seed, force=ForceFieldSpec(**force))
 
 
-def _of_quantum(asked: Mapping[str, Any]) -> dict[str, Any]:
+def longest_step_ps(scene: Scene | str) -> float:
+    """Return the longest time step at quantum level with rigid bonds to hydrogen."""
+    from systems.chemistry.graph import has_triple_bond  # loads NumPy, for which help need not wait
+
+    triple = not isinstance(scene, str) and has_triple_bond(scene)
+    return 0.5 * LONGEST_QUANTUM_STEP_PS if triple else LONGEST_QUANTUM_STEP_PS
+
+
+def _of_quantum(scene: Scene | str, asked: Mapping[str, Any]) -> dict[str, Any]:
     """Return the defaults at quantum level beside what is asked for. Raises InputError for too long a step."""
     is_flexible = asked.get("constrain_hydrogens") is False or asked.get("hydrogen_mass_da", _HYDROGEN_MASS_DA) is None
-    step_ps = asked.get("timestep_ps", _FLEXIBLE_QUANTUM_STEP_PS if is_flexible else LONGEST_QUANTUM_STEP_PS)
-    if step_ps > LONGEST_QUANTUM_STEP_PS:
-        raise InputError(f"{format_time_ps(step_ps)} is too long for {QUANTUM}; use `timestep_ps='4fs'` or less.")
+    longest_ps = longest_step_ps(scene)
+    step_ps = asked.get("timestep_ps", _FLEXIBLE_QUANTUM_STEP_PS if is_flexible else longest_ps)
+    if step_ps > longest_ps:
+        what = "a triple bond" if longest_ps < LONGEST_QUANTUM_STEP_PS else QUANTUM
+        use = format_time_ps(longest_ps).replace(" ", "")
+        raise InputError(f"{format_time_ps(step_ps)} is too long for {what}; use `timestep_ps='{use}'` or less.")
     is_long = step_ps > LONGEST_FLEXIBLE_STEP_PS
     heavy = {"hydrogen_mass_da": _HYDROGEN_MASS_DA if is_long else None, "constrain_hydrogens": is_long}
     return {"timestep_ps": step_ps, "equilibrate_ps": _QUANTUM_EQUILIBRATION_PS, **heavy}

@@ -13,6 +13,7 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
+from md_reference.run.config import longest_step_ps
 from surrogate.data import in_standard_pose
 from surrogate.models.architecture import architecture, shipped_weights
 from surrogate.models.painet.energy import PainetPotential
@@ -266,8 +267,9 @@ def match_domain(
                         force=force)  # fmt: skip
     if known is None or match.seen:
         return match
-    assert isinstance(weights.model, PainetPotential)
-    found = match._replace(deviations=(*match.deviations, *_doubts(scene, weights.model, known)))
+    model = in_step(weights, scene).model
+    assert isinstance(model, PainetPotential)
+    found = match._replace(deviations=(*match.deviations, *_doubts(scene, model, known)))
     return _refused(scene, found, weights.domain, name, force=force)
 
 
@@ -303,6 +305,7 @@ def fit_weights(
 ) -> tuple[Weights, DomainMatch]:  # fmt: skip
     """Return weights as a rollout of this scene takes them, for one molecule at one lag, and the match to that. Raises
     OutOfDomainError as `match_domain` does, InputError for a lag that the weights were not trained for."""
+    weights = in_step(weights, scene)
     match = match_domain(scene, weights, temperature_k=temperature_k, force=force)
     return at_lag(weights, match.domain, choose_lag(weights, lag_ps, save_every_ps)), match
 
@@ -322,6 +325,15 @@ def in_bath(weights: Weights, asked: dict[str, Any]) -> Weights:
     if "constrain_hydrogens" in domain.conditions:
         changed["constrain_hydrogens"] = model.config.constrain_hydrogens
     return replace(weights, model=model, domain=replace(domain, conditions={**domain.conditions, **changed}))
+
+
+def in_step(weights: Weights, scene: Scene) -> Weights:
+    """Return weights whose potential, if they are one, takes no longer steps than MD of this scene does."""
+    if not isinstance(weights.model, Potential):
+        return weights
+    longest_ps = longest_step_ps(scene)
+    is_longer = weights.model.config.timestep_ps > longest_ps
+    return in_bath(weights, {"timestep_ps": longest_ps}) if is_longer else weights
 
 
 def _peptides(model: Propagator) -> PeptideConfig | None:

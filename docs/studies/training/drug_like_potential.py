@@ -46,7 +46,7 @@ from surrogate.models.painet.model import dense_mean
 from surrogate.models.painet.potential_trainer import conditions_of
 from surrogate.models.propagator import Molecule
 from surrogate.models.weights import Chemistry, TrainingDomain, Weights, load_weights, provenance_of, save_weights
-from surrogate.sampling.domain import disagreement
+from surrogate.sampling.domain import disagreement, in_step
 from surrogate.training.devices import choose_device, torch_threads
 from surrogate.training.loop import Stage, StageConfig, train_stages
 from systems.chemistry.validity import INVALID, geometry_from_scene
@@ -398,7 +398,10 @@ def trust(given: argparse.Namespace) -> None:
     rows = []
     for one in load(given.folder, [ASIDE]):
         try:
-            spread, n_lost = disagreement(prepare(f"smiles:{one.entry.smiles}"), model)
+            scene = prepare(f"smiles:{one.entry.smiles}")
+            stepped = in_step(weights, scene).model
+            assert isinstance(stepped, PainetPotential)
+            spread, n_lost = disagreement(scene, stepped)
             whole = stays_whole(weights, one.entry.smiles, given.time, given.weights.with_suffix(".h5"))
         except SurromdError as error:
             said(f"{one.entry.smiles}: {error}")

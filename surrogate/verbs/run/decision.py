@@ -156,14 +156,15 @@ def md_ps(rates: Rates, decision: Decision, name: Stage) -> float:
 def _choose(rates: Rates, budget_s: float, way: str) -> tuple[Way, tuple[str, ...]]:
     if way == "md":
         return "md", ("asked for",)
-    if rates.rolls is not None:
+    general = rates.rolls is not None and rates.rolls.general
+    if rates.rolls is not None and not (general and budget_s >= LEAST_TRAINING_S):
         errors = expected_errors(rates, budget_s)
         best = min(error for name, error in errors.items() if "rollout" in name)
-        pays = best < errors["MD from many starts"]
+        pays = best <= errors["MD from many starts"]
         said = ", ".join(f"{100 * error:.2g} % by {name}" for name, error in errors.items())
         why = (rates.coverage, f"error to expect of a population: {said}, with {rates.relaxation_words}")
         return "rollout" if pays or way == "surrogate" else "md", why
-    none = f"no weights: {rates.coverage}"
+    none = rates.coverage if general else f"no weights: {rates.coverage}"
     if rates.expensive and rates.in_water:
         if way == "surrogate":
             raise InputError("a potential learns forces in vacuum; leave `solvent` out, or take `way='md'`.")

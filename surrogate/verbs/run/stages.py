@@ -190,9 +190,10 @@ def _with_frames(folder: Path, paths: list[Path]) -> tuple[str, ...]:
 
 
 def _train(site: Site, record: RunRecord) -> RunRecord:
-    _, decision = _rates_and_decision(record)
+    rates, decision = _rates_and_decision(record)
     options = TrainOptions(
         level=site.options.level,
+        start_from=rates.rolls.weights if rates.rolls and rates.rolls.general else None,
         budget_s=decision.seconds("train"),
         seed=site.options.seed,
         resume=True,

@@ -1,0 +1,45 @@
+"""Bonds whose vibration sets the longest time step."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from md_reference.run.config import resolve_settings
+from surrogate.models.architecture import shipped_weights
+from surrogate.models.weights import load_weights
+from surrogate.sampling.domain import in_step
+from systems.chemistry.graph import has_triple_bond
+from systems.errors import InputError
+from systems.library.named_scenes import prepare
+
+QUANTUM = {"force_field": "gfn2-xtb"}
+
+
+@pytest.mark.parametrize(
+    ("smiles", "has"),
+    [("CC#N", True), ("CC#CC", True), ("CCN=C=O", True), ("O=C=O", True), ("CC(C)=O", False), ("CN=O", False)],
+)
+def test_triple_and_cumulated_bonds_are_found_with_and_without_orders(smiles: str, has: bool) -> None:
+    scene = prepare(f"smiles:{smiles}")
+    assert has_triple_bond(scene) is has
+    if smiles != "O=C=O":  # RDKit builds it too long
+        assert has_triple_bond(replace(scene, bond_orders=np.zeros(len(scene.bonds)))) is has
+
+
+def test_quantum_md_of_a_triple_bond_takes_half_the_step() -> None:
+    nitrile, ketone = prepare("smiles:CC#N"), prepare("smiles:CC(C)=O")
+    assert resolve_settings(nitrile, QUANTUM)[0]["timestep_ps"] == 0.002
+    assert resolve_settings(ketone, QUANTUM)[0]["timestep_ps"] == 0.004
+    with pytest.raises(InputError, match="4 fs is too long for a triple bond; use `timestep_ps='2fs'` or less"):
+        resolve_settings(nitrile, QUANTUM | {"timestep_ps": 0.004})
+    assert resolve_settings(nitrile, QUANTUM | {"hydrogen_mass_da": None})[0]["timestep_ps"] == 0.0005
+
+
+def test_a_potential_takes_the_step_of_the_molecule() -> None:
+    weights = load_weights(shipped_weights()["paracetamol-gfn2-xtb"])
+    shorter = in_step(weights, prepare("smiles:CC#N"))
+    assert shorter.model.config.timestep_ps == shorter.domain.conditions["timestep_ps"] == 0.002
+    assert in_step(weights, prepare("smiles:CC(C)=O")) is weights
+    peptides = load_weights(shipped_weights()["peptides"])
+    assert in_step(peptides, prepare("smiles:CC#N")) is peptides
