@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import replace
 from itertools import pairwise
 from typing import Any, NamedTuple
@@ -398,17 +399,24 @@ def choose_weights(
         arch = architecture(header.arch)
         config = arch.config(header.config)
         peptides = config if isinstance(config, PeptideConfig) else None
+        general, level = header.domain.chemistry is not None, header.domain.conditions.get("force_field")
+        if general and (conditions or {}).get("force_field") != level:
+            with suppress(OutOfDomainError):
+                match_known(scene, header.domain, path.name, peptides, temperature_k=temperature_k)
+                asked_for = f"{name}, where its level is asked for: `level='{level}'`."
+                refusals.append((True, 0, name, OutOfDomainError(asked_for, brief=f"{name} is of another level")))
+            continue
+        apart = False
         try:
             match = match_known(scene, header.domain, path.name, peptides, temperature_k=temperature_k)
-            if header.domain.chemistry is not None:
+            apart = True  # of conditions, if at all
+            check_conditions(header.domain.conditions, conditions or {}, path.name)
+            apart = False
+            if general:  # by MD: last
                 match_domain(scene, load_weights(path), temperature_k=temperature_k)
         except OutOfDomainError as error:
-            refusals.append((not error.forcible, len(error.args[0].split("; ")), name, error))
-            continue
-        try:
-            check_conditions(header.domain.conditions, conditions or {}, path.name)
-        except OutOfDomainError as error:
-            refusals.append((False, 0, name, error))  # nothing else is apart
+            rank = (False, 0) if apart else (not error.forcible, len(error.args[0].split("; ")))
+            refusals.append((*rank, name, error))
             continue
         is_potential = isinstance(arch.model, type) and issubclass(arch.model, Potential)
         levels[name] = header.domain.conditions.get("force_field")

@@ -354,9 +354,10 @@ class LearnedForces:
                 "`level='gfn2-xtb'`."
             )
         self.scene, self.weights, self._model = scene, loaded, loaded.model.eval()
-        self._order = match_domain(scene, loaded).order
+        match = match_domain(scene, loaded)
+        self._order = match.order
         self._back = np.argsort(self._order)
-        self._molecule = Molecule.of(loaded.domain.scene)
+        self._molecule = Molecule.of(match.domain.scene)
 
     def __call__(self, positions_nm: FloatArray) -> tuple[float, FloatArray]:
         """Positions `(n_atoms, 3)` nm -> energy in kJ/mol, forces `(n_atoms, 3)` in kJ/mol/nm."""

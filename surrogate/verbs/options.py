@@ -117,6 +117,8 @@ class ReferenceOptions(MDSettings, Joining, Preparation, Seeded, Resuming, Overw
 class RolloutOptions(RolloutConfig, Joining, Preparation, Resuming, Overwriting, Quiet):
     """Options of `rollout`."""
 
+    level: str | None = option("Level of theory of shipped weights: mm or gfn2-xtb.", None, unset="that of any")
+
 
 @dataclass(frozen=True, kw_only=True)
 class OnDask:

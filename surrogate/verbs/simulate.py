@@ -152,13 +152,14 @@ def rollout(
 ) -> list[Path]:
     """Roll a scene forward with a trained surrogate, in chunks, and return the trajectories written.
 
-    `weights`: the name of shipped weights or a .safetensors file; None takes the shipped ones that cover the scene, and
-    says which and why. Atoms are written in the scene's own order, frames at the interval of the weights or a multiple
-    of it (`save_every_ps`), each marked with its chunk and validity. Weights that were trained for several lags step at
-    `lag_ps`, by default at the longest that `save_every_ps` is a multiple of; weights of several peptides take others
-    of the same residues. Replicas run in one batch, are named as by `reference` and joined as there. `solver`:
-    'multistep', 'fitted' (for few `solver_steps`, 2 to 10), 'euler' or the adaptive 'dopri5', None for the one that
-    suits the weights. `precision`: 'fp32', 'bf16' or 'auto'.
+    `weights`: the name of shipped weights or a .safetensors file; None takes the shipped ones that cover the scene, of
+    this `level` of theory, and says which and why; 'gfn2-xtb' is of any drug-like molecule. Atoms are written in the
+    scene's own order, frames at the interval of the weights or a multiple of it (`save_every_ps`), each marked with its
+    chunk and validity. Weights that were trained for several lags step at `lag_ps`, by default at the longest that
+    `save_every_ps` is a multiple of; weights of several peptides take others of the same residues. Replicas run in one
+    batch, are named as by `reference` and joined as there. `solver`: 'multistep', 'fitted' (for few `solver_steps`, 2
+    to 10), 'euler' or the adaptive 'dopri5', None for the one that suits the weights. `precision`: 'fp32', 'bf16' or
+    'auto'.
 
     Every frame is checked as it is made against what the training reference does. `guard` says what is done about one
     that fails: 'flag' marks it, 'resample' draws the chunk again, 'repair' relaxes it with OpenMM, 'fallback' runs real
@@ -176,15 +177,18 @@ def rollout(
     molecule = prepare_scene(scene, options, quiet=options.quiet)
 
     from surrogate.models.weights import load_weights
-    from surrogate.sampling.domain import choose_lag, choose_weights
+    from surrogate.sampling.domain import check_conditions, choose_lag, choose_weights
     from surrogate.sampling.runner import rollout as roll
 
     config = part_of(options, RolloutConfig)
+    force_field = at_level(options.level, None)
+    conditions = {} if force_field is None else {"force_field": force_field}
     if file is None:
-        loaded, why = choose_weights(molecule, temperature_k=config.temperature_k)
+        loaded, why = choose_weights(molecule, temperature_k=config.temperature_k, conditions=conditions)
         tell(molecule.name, why, quiet=options.quiet)
     else:
         loaded = load_weights(file)
+        check_conditions(loaded.domain.conditions, conditions, loaded.path.name)
     saved_ps = choose_lag(loaded, config.lag_ps, None) if config.save_every_ps is None else config.save_every_ps
     # The verb counts the frames of one replica; all advance together.
     ps_per_frame = saved_ps * len(files[0])

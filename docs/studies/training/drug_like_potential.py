@@ -3,14 +3,16 @@
     python docs/studies/training/drug_like_potential.py train FOLDER -o OUT.safetensors --budget 6h [--resume]
     python docs/studies/training/drug_like_potential.py errors OUT.safetensors FOLDER
     python docs/studies/training/drug_like_potential.py trust OUT.safetensors FOLDER [--time 250ps]
+    python docs/studies/training/drug_like_potential.py stability OUT.safetensors FOLDER [--time 250ps] [--molecules 50]
     python docs/studies/training/drug_like_potential.py tune OUT.safetensors FOLDER [--seconds 60 180] [--molecules 10]
 
 FOLDER is what drug_like_states.py labels. A step takes some molecules and some states of each. Energies count less
 their mean over a molecule's states, so that no baseline of atoms is needed; each member of the potential learns from
 three molecules in four, so that members disagree about chemistry that they have not seen. `errors` prints errors on
 the molecules that are held out, beside those that are trained on. `trust` rolls molecules that are neither, measures
-where the members' spread (`sampling.domain`) tells those that fly apart, and writes that limit into the weights. `tune`
-trains on held-out molecules one by one, beginning with the weights and with nothing, as `surromd train` does.
+where the members' spread (`sampling.domain`) tells those that fly apart, and writes that limit into the weights.
+`stability` rolls held-out molecules that the weights then do not refuse. `tune` trains on held-out molecules one by
+one, beginning with the weights and with nothing, as `surromd train` does.
 """
 
 from __future__ import annotations
@@ -46,7 +48,7 @@ from surrogate.models.painet.model import dense_mean
 from surrogate.models.painet.potential_trainer import conditions_of
 from surrogate.models.propagator import Molecule
 from surrogate.models.weights import Chemistry, TrainingDomain, Weights, load_weights, provenance_of, save_weights
-from surrogate.sampling.domain import disagreement, in_step
+from surrogate.sampling.domain import disagreement, in_step, match_domain
 from surrogate.training.devices import choose_device, torch_threads
 from surrogate.training.loop import Stage, StageConfig, train_stages
 from systems.chemistry.validity import INVALID, geometry_from_scene
@@ -427,6 +429,23 @@ def trust(given: argparse.Namespace) -> None:
     save_weights(given.weights, model, domain, {**weights.provenance, **energies})
 
 
+def stability(given: argparse.Namespace) -> None:
+    """Roll molecules that are held out, but those that are refused."""
+    weights = load_weights(given.weights)
+    refused, whole = 0, []
+    for one in load(given.folder, ["test"], given.molecules):
+        try:
+            match_domain(prepare(f"smiles:{one.entry.smiles}"), weights)
+        except SurromdError as error:
+            refused += 1
+            said(f"{one.entry.smiles}: refused: {getattr(error, 'brief', error)}")
+            continue
+        whole.append(stays_whole(weights, one.entry.smiles, given.time, given.weights.with_suffix(".h5")))
+        said(f"{one.entry.smiles}: {100 * whole[-1]:.0f} % of replicas whole")
+    said(f"{len(whole)} molecules rolled for {given.time:g} ps in {REPLICAS} replicas, {refused} refused: "
+         f"{sum(w == 1.0 for w in whole)} without a replica lost")  # fmt: skip
+
+
 def tune(given: argparse.Namespace) -> None:
     """Print errors of forces after so much training on one molecule, from the weights and from nothing."""
     for one in load(given.folder, ["test"], given.molecules):
@@ -453,14 +472,17 @@ def said(line: str) -> None:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     verbs = parser.add_subparsers(dest="verb", required=True)
-    training, errors, trusting, tuning = (verbs.add_parser(name) for name in ("train", "errors", "trust", "tune"))
-    for part in (errors, trusting, tuning):
+    names = ("train", "errors", "trust", "stability", "tune")
+    training, errors, trusting, staying, tuning = (verbs.add_parser(name) for name in names)
+    for part in (errors, trusting, staying, tuning):
         part.add_argument("weights", type=Path)
-    for part in (training, errors, trusting, tuning):
+    for part in (training, errors, trusting, staying, tuning):
         part.add_argument("folder", type=Path)
     tuning.add_argument("--seconds", type=float, nargs="+", default=[60.0, 180.0])
     tuning.add_argument("--molecules", type=int, default=10)
-    trusting.add_argument("--time", type=lambda text: parse_time_ps(text, "--time"), default=250.0)
+    staying.add_argument("--molecules", type=int, default=50)
+    for part in (trusting, staying):
+        part.add_argument("--time", type=lambda text: parse_time_ps(text, "--time"), default=250.0)
     training.add_argument("--width", type=int, default=96)
     training.add_argument("--steps-of-network", type=int, default=2)
     training.add_argument("--sums", type=int, nargs=3, default=[16, 8, 4], help="scalars, vectors, tensors of a look")
@@ -476,7 +498,7 @@ def main() -> None:
     training.add_argument("--threads", type=int, default=1)
     training.add_argument("--validate", type=float, default=300.0)
     given = parser.parse_args()
-    {"train": train, "errors": print_errors, "trust": trust, "tune": tune}[given.verb](given)
+    {"train": train, "errors": print_errors, "trust": trust, "stability": stability, "tune": tune}[given.verb](given)
 
 
 if __name__ == "__main__":

@@ -160,7 +160,8 @@ def _choose(rates: Rates, budget_s: float, way: str) -> tuple[Way, tuple[str, ..
     if rates.rolls is not None and not (general and budget_s >= LEAST_TRAINING_S):
         errors = expected_errors(rates, budget_s)
         best = min(error for name, error in errors.items() if "rollout" in name)
-        pays = best <= errors["MD from many starts"]
+        others = errors["MD from many starts"]
+        pays = best < others or (rates.expensive and best == others)  # little of either, but more of the rollout
         said = ", ".join(f"{100 * error:.2g} % by {name}" for name, error in errors.items())
         why = (rates.coverage, f"error to expect of a population: {said}, with {rates.relaxation_words}")
         return "rollout" if pays or way == "surrogate" else "md", why

@@ -93,7 +93,7 @@ def test_an_unseen_peptide_gets_the_weights_of_peptides(sequence: str) -> None:
     assert weights.path.stem == "peptides" and "without having seen it" in why
 
 
-@pytest.mark.parametrize("scene", ["smiles:c1ccccc1", "smiles:CCCCCO", "sequence:ACE-ASH-NME"])
+@pytest.mark.parametrize("scene", ["smiles:C[Si](C)(C)C", "smiles:CB(O)O", "smiles:CC[O]"])
 def test_a_molecule_that_none_covers_is_refused_with_a_reason(scene: str) -> None:
     with pytest.raises(OutOfDomainError, match=r"no shipped weights cover .* The nearest: .*does not cover"):
         choose_weights(prepare(scene))
@@ -135,5 +135,11 @@ def test_weights_of_another_force_field_are_no_choice_where_one_is_asked_for() -
     quantum, classical = {"force_field": "gfn2-xtb", "solvent": "vacuum"}, {"force_field": "ff14SB", "solvent": "obc2"}
     assert choose_weights(paracetamol, conditions=quantum)[0].path.stem == "paracetamol-gfn2-xtb"
     assert choose_weights(peptide, conditions=classical)[0].path.stem == "peptides"
+    drug = prepare("smiles:CCOc1ccccc1")
+    assert choose_weights(drug, conditions=quantum)[0].path.stem == "drug-like-gfn2-xtb"
+    with pytest.raises(
+        OutOfDomainError, match="The nearest: drug-like-gfn2-xtb, where its level is asked for: `level='gfn2"
+    ):
+        choose_weights(drug)
     with pytest.raises(OutOfDomainError, match="other conditions: force_field gfn2-xtb, not ff14SB"):
         choose_weights(paracetamol, conditions=classical)

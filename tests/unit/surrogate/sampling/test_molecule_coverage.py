@@ -100,4 +100,6 @@ def test_a_molecule_on_which_they_agree_is_rolled(
     strict = saved(tmp_path / "strict.safetensors", general, replace(TRUSTED, spread_kj_mol_nm=1.0))
     monkeypatch.setattr(coverage, "shipped_weights", lambda: {"strict": strict.path})
     with pytest.raises(OutOfDomainError, match=r"no shipped weights cover .*; 1 is trusted"):
+        choose_weights(prepare("smiles:CNC(C)=O"), conditions={"force_field": "gfn2-xtb"})
+    with pytest.raises(OutOfDomainError, match="The nearest: strict, where its level is asked for: `level='gfn2-xtb'`"):
         choose_weights(prepare("smiles:CNC(C)=O"))

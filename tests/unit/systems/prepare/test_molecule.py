@@ -357,3 +357,17 @@ def test_a_file_that_calls_its_drawing_three_dimensional_is_embedded(tmp_path: P
     block = Chem.MolToMolBlock(flat)
     (tmp_path / "y.sdf").write_text(block)
     assert prepare(str(tmp_path / "y.sdf")).provenance["repairs"] == []
+
+
+def test_a_methylene_group_that_is_embedded_flat_is_embedded_anew(monkeypatch: pytest.MonkeyPatch) -> None:
+    """RDKit leaves this one with its two neighbours in a line."""
+    fenoldopam = "smiles:Oc1ccc(C2CNCCc3c2cc(O)c(O)c3Cl)cc1"
+
+    def widest() -> float:
+        x = prepare(fenoldopam).positions_nm
+        a, b = x[5] - x[6], x[7] - x[6]
+        return float(np.degrees(np.arccos(a @ b / np.linalg.norm(a) / np.linalg.norm(b))))
+
+    assert 105.0 < widest() < 120.0
+    monkeypatch.setattr("systems.prepare.molecule._ATTEMPTS", 1)
+    assert widest() > 170.0, "control"
