@@ -415,8 +415,9 @@ def choose_weights(
             if general:  # by MD: last
                 match_domain(scene, load_weights(path), temperature_k=temperature_k)
         except OutOfDomainError as error:
-            rank = (False, 0) if apart else (not error.forcible, len(error.args[0].split("; ")))
-            refusals.append((*rank, name, error))
+            # Those of many molecules come nearest.
+            n_reasons = 0 if general else len(error.args[0].split("; "))
+            refusals.append((*((False, 0) if apart else (not error.forcible, n_reasons)), name, error))
             continue
         is_potential = isinstance(arch.model, type) and issubclass(arch.model, Potential)
         levels[name] = header.domain.conditions.get("force_field")

@@ -1,9 +1,9 @@
 """What a force of PAINET as a potential costs, by torch and by SIMD, alone and in batches, beside GFN2-xTB's, in
 processor time of one core (the least of several).
 
-    python docs/studies/surrogates/potential_speed.py [--batches 1,32,256] [SMILES...]
+    python docs/studies/surrogates/potential_speed.py [--batches 1,32,256] [--weights NAME] [SMILES...]
 
-The weights are those that training begins with: the cost does not depend on them.
+Of the size that training begins with, or of that of some weights.
 """
 
 from __future__ import annotations
@@ -17,9 +17,11 @@ from functools import partial
 import torch
 
 from md_reference.forces.quantum import Potential
+from surrogate.models.architecture import weights_path
 from surrogate.models.painet.energy import PainetPotential, PotentialConfig
 from surrogate.models.potential import gradient_of
 from surrogate.models.propagator import Molecule
+from surrogate.models.weights import read_header
 from systems.prepare.molecule import scene_from_smiles
 
 # Glycol, aspirin, paracetamol.
@@ -46,10 +48,12 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("molecules", nargs="*", default=MOLECULES)
     parser.add_argument("--batches", default="1,32,256")
+    parser.add_argument("--weights")
     given = parser.parse_args()
     torch.set_num_threads(1)
     torch.manual_seed(0)
-    model = PainetPotential(PotentialConfig()).eval().requires_grad_(False)
+    own = {} if given.weights is None else read_header(weights_path(given.weights)).config
+    model = PainetPotential(PotentialConfig.from_dict(own)).eval().requires_grad_(False)
     for smiles in given.molecules:
         scene = scene_from_smiles(smiles)
         molecule, reference = Molecule.of(scene), Potential(scene)
