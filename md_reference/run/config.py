@@ -200,10 +200,10 @@ def to_config(values: Mapping[str, Any], *, seed: int) -> MDConfig:
 
 def longest_step_ps(scene: Scene | str) -> float:
     """Return the longest time step at quantum level with rigid bonds to hydrogen."""
-    from systems.chemistry.graph import has_triple_bond  # loads NumPy, for which help need not wait
+    from systems.chemistry.graph import has_stiff_bond  # loads NumPy, for which help need not wait
 
-    triple = not isinstance(scene, str) and has_triple_bond(scene)
-    return 0.5 * LONGEST_QUANTUM_STEP_PS if triple else LONGEST_QUANTUM_STEP_PS
+    is_stiff = not isinstance(scene, str) and has_stiff_bond(scene)
+    return 0.5 * LONGEST_QUANTUM_STEP_PS if is_stiff else LONGEST_QUANTUM_STEP_PS
 
 
 def _of_quantum(scene: Scene | str, asked: Mapping[str, Any]) -> dict[str, Any]:
@@ -212,7 +212,7 @@ def _of_quantum(scene: Scene | str, asked: Mapping[str, Any]) -> dict[str, Any]:
     longest_ps = longest_step_ps(scene)
     step_ps = asked.get("timestep_ps", _FLEXIBLE_QUANTUM_STEP_PS if is_flexible else longest_ps)
     if step_ps > longest_ps:
-        what = "a triple bond" if longest_ps < LONGEST_QUANTUM_STEP_PS else QUANTUM
+        what = "so stiff a bond (triple, aldehyde, imine, =CH2)" if longest_ps < LONGEST_QUANTUM_STEP_PS else QUANTUM
         use = format_time_ps(longest_ps).replace(" ", "")
         raise InputError(f"{format_time_ps(step_ps)} is too long for {what}; use `timestep_ps='{use}'` or less.")
     is_long = step_ps > LONGEST_FLEXIBLE_STEP_PS

@@ -153,22 +153,30 @@ def _cis_trans(positions_nm: FloatArray, neighbours: list[list[int]], colours: l
     return "cis" if abs(angle) < np.pi / 2 else "trans"
 
 
-# Between two atoms of at most two bonds: nitriles 0.116 nm, alkynes 0.121, azides 0.113, isocyanates 0.117 and 0.121.
-_TRIPLE_NM = 0.1225
+# Between two atoms of at most two bonds: nitriles 0.116 nm, alkynes 0.121, azides 0.113, isocyanates 0.117, 0.121. Of a
+# carbon that bears hydrogen to N or O: aldehydes 0.121, imines 0.128; in aromatic rings 0.132 and more.
+_TRIPLE_NM, _DOUBLE_NM = 0.1225, 0.130
 
 
-def has_triple_bond(scene: Scene) -> bool:
-    """Return whether a bond of heavy atoms is triple or one of two double bonds of an atom, as its order or its length
-    says: it vibrates at 2,000 to 2,300 per cm, which steps of 4 fs do not follow."""
+def has_stiff_bond(scene: Scene) -> bool:
+    """Return whether MD with heavy hydrogens cannot take steps of 4 fs: for a bond that is triple or one of two double
+    bonds of an atom (2,000 to 2,300 per cm), or for a double bond of a carbon that gave mass to its hydrogens: of
+    aldehydes, imines and =CH2. Orders, lengths and numbers of bonds tell."""
     degree, order = (
         np.bincount(scene.bonds.ravel(), weights=weights, minlength=scene.n_atoms)
         for weights in (None, np.repeat(scene.bond_orders, 2))
     )
     if (scene.bond_orders == 3.0).any() or ((degree == 2) & (order == 4.0)).any():
         return True
-    heavy = np.array([e != "H" for e in scene.elements])
-    i, j = scene.bonds[(heavy & (degree <= 2))[scene.bonds].all(1)].T
-    return bool((np.linalg.norm(scene.positions_nm[i] - scene.positions_nm[j], axis=-1) < _TRIPLE_NM).any())
+    element = np.array(scene.elements)
+    i, j = np.concatenate([scene.bonds, scene.bonds[:, ::-1]]).T
+    n_hydrogens = np.bincount(i[element[j] == "H"], minlength=scene.n_atoms)
+    if ((element == "C") & (degree == 3) & (n_hydrogens == 2)).any():
+        return True
+    length = np.linalg.norm(scene.positions_nm[i] - scene.positions_nm[j], axis=-1)
+    triple = (degree[i] <= 2) & (degree[j] <= 2) & (element[i] != "H") & (element[j] != "H") & (length < _TRIPLE_NM)
+    double = (n_hydrogens[i] > 0) & (element[i] == "C") & np.isin(element[j], ("N", "O")) & (length < _DOUBLE_NM)
+    return bool((triple | double).any())
 
 
 def ring_sizes(graph: nx.Graph) -> dict[tuple[int, int], int]:

@@ -108,6 +108,19 @@ def test_forces_by_simd_are_those_of_torch(config: PotentialConfig, rows: int) -
 
 
 @needs_compiler
+def test_simd_is_finite_where_a_unit_is_as_far_below_zero_as_exponentials_go() -> None:
+    """An exponential that overflowed made no number of a quotient, and ended MD."""
+    molecule, model, x = branched_chain(9), lively(), walks(9, 16)
+    model.network.looks[0].update[0].bias.sub_(torch.linspace(0.0, 200.0, SMALL.width))
+    members, gradient = model.gradient(x, molecule)(x)
+    exact = lively()
+    exact.load_state_dict(model.state_dict())
+    expected = exact.double().evaluate(x, molecule)
+    torch.testing.assert_close(members, expected.members_kj_mol, rtol=1e-5, atol=1e-2)
+    assert (gradient + expected.forces_kj_mol_nm).abs().max() < 1e-4 * expected.forces_kj_mol_nm.abs().mean()
+
+
+@needs_compiler
 @pytest.mark.parametrize("rows", [2, 19])
 @pytest.mark.parametrize("timestep_ps", [0.001, 0.004])
 def test_steps_by_simd_are_those_of_torch(timestep_ps: float, rows: int, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -50,17 +50,20 @@ static inline V *take(V *&work, int64_t n) {
 
 INLINE V above_zero(V a) { return larger(a, splat(0.0f)); }
 
+// Beyond e^80 a quotient by Newton's steps is no number: they take infinity times zero.
+static float below(float exponent) { return exponent < 80.0f ? exponent : 80.0f; }
+
 static void silu(const V *x, V *y, int64_t n) {
     const float *a = (const float *)x;
     float *b = (float *)y;
-    _Pragma("omp simd") for (int64_t k = 0; k < n * W; k++) b[k] = a[k] / (1.0f + expf(-a[k]));
+    _Pragma("omp simd") for (int64_t k = 0; k < n * W; k++) b[k] = a[k] / (1.0f + expf(below(-a[k])));
 }
 
 static void silu_back(const V *x, V *dy, int64_t n) {
     const float *a = (const float *)x;
     float *d = (float *)dy;
     _Pragma("omp simd") for (int64_t k = 0; k < n * W; k++) {
-        const float g = 1.0f / (1.0f + expf(-a[k]));
+        const float g = 1.0f / (1.0f + expf(below(-a[k])));
         d[k] *= g * (1.0f + a[k] * (1.0f - g));
     }
 }
