@@ -198,18 +198,17 @@ def to_config(values: Mapping[str, Any], *, seed: int) -> MDConfig:
     return MDConfig(**own, seed=seed, force=ForceFieldSpec(**force))
 
 
-def longest_step_ps(scene: Scene | str) -> float:
+def _longest_step_ps(scene: Scene | str) -> float:
     """Return the longest time step at quantum level with rigid bonds to hydrogen."""
-    from systems.chemistry.graph import has_stiff_bond  # loads NumPy, for which help need not wait
+    from systems.chemistry.graph import STIFF_STEP_PS, has_stiff_bond  # loads NumPy, for which help need not wait
 
-    is_stiff = not isinstance(scene, str) and has_stiff_bond(scene)
-    return 0.5 * LONGEST_QUANTUM_STEP_PS if is_stiff else LONGEST_QUANTUM_STEP_PS
+    return STIFF_STEP_PS if not isinstance(scene, str) and has_stiff_bond(scene) else LONGEST_QUANTUM_STEP_PS
 
 
 def _of_quantum(scene: Scene | str, asked: Mapping[str, Any]) -> dict[str, Any]:
     """Return the defaults at quantum level beside what is asked for. Raises InputError for too long a step."""
     is_flexible = asked.get("constrain_hydrogens") is False or asked.get("hydrogen_mass_da", _HYDROGEN_MASS_DA) is None
-    longest_ps = longest_step_ps(scene)
+    longest_ps = _longest_step_ps(scene)
     step_ps = asked.get("timestep_ps", _FLEXIBLE_QUANTUM_STEP_PS if is_flexible else longest_ps)
     if step_ps > longest_ps:
         what = "so stiff a bond (triple, aldehyde, imine, =CH2)" if longest_ps < LONGEST_QUANTUM_STEP_PS else QUANTUM

@@ -14,7 +14,6 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
-from md_reference.run.config import longest_step_ps
 from surrogate.data import in_standard_pose
 from surrogate.models.architecture import architecture, shipped_weights
 from surrogate.models.painet.energy import PainetPotential
@@ -24,7 +23,7 @@ from surrogate.models.peptides.model import PeptideSlide
 from surrogate.models.potential import Potential
 from surrogate.models.propagator import Propagator, draw_noise
 from surrogate.models.weights import Chemistry, TrainingDomain, Weights, load_weights, read_header
-from systems.chemistry.graph import bonded_graph, match_atoms
+from systems.chemistry.graph import STIFF_STEP_PS, bonded_graph, has_stiff_bond, match_atoms
 from systems.chemistry.validity import INVALID, NOT_FINITE, Geometry, check_frames, flag_names, geometry_from_scene
 from systems.errors import InputError, OutOfDomainError
 from systems.scene import ATOMIC_NUMBERS, Scene
@@ -330,11 +329,9 @@ def in_bath(weights: Weights, asked: dict[str, Any]) -> Weights:
 
 def in_step(weights: Weights, scene: Scene) -> Weights:
     """Return weights whose potential, if they are one, takes no longer steps than MD of this scene does."""
-    if not isinstance(weights.model, Potential):
-        return weights
-    longest_ps = longest_step_ps(scene)
-    is_longer = weights.model.config.timestep_ps > longest_ps
-    return in_bath(weights, {"timestep_ps": longest_ps}) if is_longer else weights
+    model = weights.model
+    too_long = isinstance(model, Potential) and model.config.timestep_ps > STIFF_STEP_PS and has_stiff_bond(scene)
+    return in_bath(weights, {"timestep_ps": STIFF_STEP_PS}) if too_long else weights
 
 
 def _peptides(model: Propagator) -> PeptideConfig | None:
@@ -406,16 +403,15 @@ def choose_weights(
                 asked_for = f"{name}, where its level is asked for: `level='{level}'`."
                 refusals.append((True, 0, name, OutOfDomainError(asked_for, brief=f"{name} is of another level")))
             continue
-        apart = False
+        apart = False  # of conditions
         try:
             match = match_known(scene, header.domain, path.name, peptides, temperature_k=temperature_k)
-            apart = True  # of conditions, if at all
+            apart = True
             check_conditions(header.domain.conditions, conditions or {}, path.name)
             apart = False
             if general:  # by MD: last
                 match_domain(scene, load_weights(path), temperature_k=temperature_k)
         except OutOfDomainError as error:
-            # Those of many molecules come nearest.
             n_reasons = 0 if general else len(error.args[0].split("; "))
             refusals.append((*((False, 0) if apart else (not error.forcible, n_reasons)), name, error))
             continue

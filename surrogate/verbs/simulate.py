@@ -181,8 +181,7 @@ def rollout(
     from surrogate.sampling.runner import rollout as roll
 
     config = part_of(options, RolloutConfig)
-    force_field = at_level(options.level, None)
-    conditions = {} if force_field is None else {"force_field": force_field}
+    conditions = {"force_field": level} if (level := at_level(options.level, None)) else {}
     if file is None:
         loaded, why = choose_weights(molecule, temperature_k=config.temperature_k, conditions=conditions)
         tell(molecule.name, why, quiet=options.quiet)

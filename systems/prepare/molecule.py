@@ -359,14 +359,12 @@ def _stretched_angle(molecule: Any) -> bool:
     """Return whether a carbon or nitrogen of three or four bonds has two of them in a line: a saddle on which ETKDG
     leaves a methylene group now and then (one molecule in 700), and no force field gets it off."""
     x = molecule.GetConformer().GetPositions()
-    for atom in molecule.GetAtoms():
-        near = [n.GetIdx() for n in atom.GetNeighbors()]
-        if atom.GetSymbol() in "CN" and len(near) > 2:
-            ways = x[near] - x[atom.GetIdx()]
-            ways /= np.linalg.norm(ways, axis=1, keepdims=True)
-            if (ways @ ways.T).min() < _IN_LINE:
-                return True
-    return False
+    centres = (
+        (a.GetIdx(), [n.GetIdx() for n in a.GetNeighbors()]) for a in molecule.GetAtoms() if a.GetSymbol() in "CN"
+    )
+    ways = (x[near] - x[atom] for atom, near in centres if len(near) > 2)
+    units = (way / np.linalg.norm(way, axis=1, keepdims=True) for way in ways)
+    return any((unit @ unit.T).min() < _IN_LINE for unit in units)
 
 
 def stereo_labels(molecule: Any) -> dict[tuple[int, ...], str]:

@@ -122,6 +122,8 @@ def _shares(rates: Rates, way: Way, budget_s: float, left_s: float) -> dict[Stag
     shares = PLANS[way].shares
     if way != "rollout" or rates.rolls is None:
         return shares
+    if rates.expensive:
+        return {"rollout": _MOST_ROLLED, "held-out md": 1.0 - _MOST_ROLLED}
     errors = expected_errors(rates, budget_s)
     if errors["a rollout alone"] >= errors["MD from rollout frames"]:
         return shares
@@ -160,8 +162,8 @@ def _choose(rates: Rates, budget_s: float, way: str) -> tuple[Way, tuple[str, ..
     if rates.rolls is not None and not (general and budget_s >= LEAST_TRAINING_S):
         errors = expected_errors(rates, budget_s)
         best = min(error for name, error in errors.items() if "rollout" in name)
-        others = errors["MD from many starts"]
-        pays = best < others or (rates.expensive and best == others)  # little of either, but more of the rollout
+        # Where both come to little, an expensive reference comes to less.
+        pays = best - 1e-9 * rates.expensive < errors["MD from many starts"]
         said = ", ".join(f"{100 * error:.2g} % by {name}" for name, error in errors.items())
         why = (rates.coverage, f"error to expect of a population: {said}, with {rates.relaxation_words}")
         return "rollout" if pays or way == "surrogate" else "md", why

@@ -113,19 +113,11 @@ def measure(scene: Scene, config: MDConfig, named: str | Path | None, cores: int
     assert plan.us_per_step is not None
     weights, coverage = _covering(scene, config, named)
     rates = Rates(
-        n_atoms=scene.n_atoms,
-        cores=cores,
-        stretch=stretch,
-        expensive=config.force.force_field == QUANTUM,
-        in_water=config.force.solvent in QUANTUM_SOLVENTS,
-        md=plan.line,
-        step_s=plan.us_per_step * 1e-6,
-        timestep_ps=config.timestep_ps,
-        md_ps_per_s=0.0,
-        coverage=coverage,
+        n_atoms=scene.n_atoms, cores=cores, stretch=stretch, expensive=config.force.force_field == QUANTUM,
+        in_water=config.force.solvent in QUANTUM_SOLVENTS, md=plan.line, step_s=plan.us_per_step * 1e-6,
+        timestep_ps=config.timestep_ps, md_ps_per_s=0.0, coverage=coverage, platform=by_openmm.platform,
         rolls=None if weights is None else rollout_rate(scene, weights, config.temperature_k, stretch, cores),
-        platform=by_openmm.platform,
-    )
+    )  # fmt: skip
     rates = replace(rates, md_ps_per_s=rates.openmm_ps_per_s)
     return rates if rates.expensive or config.platform not in ("auto", SIMD) else _by_simd(rates, scene, config)
 

@@ -192,13 +192,9 @@ def _with_frames(folder: Path, paths: list[Path]) -> tuple[str, ...]:
 def _train(site: Site, record: RunRecord) -> RunRecord:
     rates, decision = _rates_and_decision(record)
     options = TrainOptions(
-        level=site.options.level,
-        start_from=rates.rolls.weights if rates.rolls and rates.rolls.general else None,
-        budget_s=decision.seconds("train"),
-        seed=site.options.seed,
-        resume=True,
-        quiet=True,
-    )
+        level=site.options.level, start_from=rates.rolls.weights if rates.rolls and rates.rolls.general else None,
+        budget_s=decision.seconds("train"), seed=site.options.seed, resume=True, quiet=True,
+    )  # fmt: skip
     train(site.scene, site.folder / WEIGHTS_NAME, options=options)
     return _rolling(site, record) or record
 
@@ -302,19 +298,12 @@ def outcome(
     if answer is not None and on_surrogate and not answer.is_sure and not answer.is_by_surrogate:
         on_surrogate = "MD has not converged, and cannot say whether the surrogate's populations are right."
     return Outcome(
-        headline=" ".join(lines),
-        in_short=lines,
+        headline=" ".join(lines), in_short=lines,
         details=" ".join(filter(None, (on_surrogate, said, _remedy(comparison, costs)))),
-        status=evaluated.status,
-        verdict=evaluated.verdict,
-        held_out_ps=sum(a.total_ps for a in held),
-        rolled_ps=evaluated.summary.total_ps,
-        equivalent_time=found.in_words() if found else "",
-        speed_up=speed_up,
-        on_surrogate=on_surrogate,
-        converged=answer.holds and not answer.missing if answer else False,
-        notes=notes,
-    )
+        status=evaluated.status, verdict=evaluated.verdict, held_out_ps=sum(a.total_ps for a in held),
+        rolled_ps=evaluated.summary.total_ps, equivalent_time=found.in_words() if found else "", speed_up=speed_up,
+        on_surrogate=on_surrogate, converged=answer.holds and not answer.missing if answer else False, notes=notes,
+    )  # fmt: skip
 
 
 def lines_of(way: Way, evaluated: Evaluation, answer: Answer | None) -> tuple[str, str, str]:
