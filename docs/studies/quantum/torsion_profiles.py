@@ -63,7 +63,7 @@ def unseen(name: str, n: int) -> list[list[str]]:
         if lines:
             off = np.concatenate(lines)
             offs.append(off)
-            found.append([smiles, str(len(lines)), str(len(off)), f"{np.sqrt(np.square(off).mean()):.2f}",
+            found.append([f"`{smiles}`", str(len(lines)), str(len(off)), f"{np.sqrt(np.square(off).mean()):.2f}",
                           f"{np.abs(off).max():.2f}"])  # fmt: skip
     every = np.concatenate(offs)
     middle = np.median([np.sqrt(np.square(off).mean()) for off in offs])
