@@ -400,8 +400,8 @@ def choose_weights(
         if general and (conditions or {}).get("force_field") != level:
             with suppress(OutOfDomainError):
                 match_known(scene, header.domain, path.name, peptides, temperature_k=temperature_k)
-                asked_for = f"{name}, where its level is asked for: `level='{level}'`."
-                refusals.append((True, 0, name, OutOfDomainError(asked_for, brief=f"{name} is of another level")))
+                said = f"{name}, where its level is asked for: `level='{level}'`."
+                refusals.append((True, 0, name, OutOfDomainError(said, brief=f"{name} is of another level")))
             continue
         apart = False  # of conditions
         try:

@@ -154,10 +154,9 @@ def _cis_trans(positions_nm: FloatArray, neighbours: list[list[int]], colours: l
 
 
 # Between two atoms of at most two bonds: nitriles 0.116 nm, alkynes 0.121, azides 0.113, isocyanates 0.117, 0.121. Of a
-# carbon that bears hydrogen to N or O: aldehydes 0.121, imines 0.128; in aromatic rings 0.132 and more.
-_TRIPLE_NM, _DOUBLE_NM = 0.1225, 0.130
-# Longest step of MD at quantum level with such a bond.
-STIFF_STEP_PS = 0.002
+# carbon that bears hydrogen to N or O: aldehydes 0.121, imines 0.128; in aromatic rings 0.132 and more. And the longest
+# step of MD at quantum level with such a bond.
+_TRIPLE_NM, _DOUBLE_NM, STIFF_STEP_PS = 0.1225, 0.130, 0.002
 
 
 def has_stiff_bond(scene: Scene) -> bool:

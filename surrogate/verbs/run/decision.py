@@ -158,8 +158,7 @@ def md_ps(rates: Rates, decision: Decision, name: Stage) -> float:
 def _choose(rates: Rates, budget_s: float, way: str) -> tuple[Way, tuple[str, ...]]:
     if way == "md":
         return "md", ("asked for",)
-    general = rates.rolls is not None and rates.rolls.general
-    if rates.rolls is not None and not (general and budget_s >= LEAST_TRAINING_S):
+    if rates.rolls is not None:
         errors = expected_errors(rates, budget_s)
         best = min(error for name, error in errors.items() if "rollout" in name)
         # Where both come to little, an expensive reference comes to less.
@@ -167,7 +166,7 @@ def _choose(rates: Rates, budget_s: float, way: str) -> tuple[Way, tuple[str, ..
         said = ", ".join(f"{100 * error:.2g} % by {name}" for name, error in errors.items())
         why = (rates.coverage, f"error to expect of a population: {said}, with {rates.relaxation_words}")
         return "rollout" if pays or way == "surrogate" else "md", why
-    none = rates.coverage if general else f"no weights: {rates.coverage}"
+    none = f"no weights: {rates.coverage}"
     if rates.expensive and rates.in_water:
         if way == "surrogate":
             raise InputError("a potential learns forces in vacuum; leave `solvent` out, or take `way='md'`.")

@@ -39,15 +39,13 @@ _MOST_ATOMS_BY_SIMD = 3000
 @dataclass(frozen=True)
 class Rolls:
     """How weights (a name or a file) roll: frames `lag_ps` apart, ps in a second of wall time, replicas together;
-    `relaxation_ps` of the slowest motion in the rollouts that were measured, 0 where they are too short to show one;
-    `general`: a potential of many molecules, which learns this one better where there is time."""
+    `relaxation_ps` of the slowest motion in the rollouts that were measured, 0 where they are too short to show one."""
 
     weights: str
     lag_ps: float
     ps_per_s: float
     replicas: int = REPLICAS
     relaxation_ps: float = 0.0
-    general: bool = False
 
 
 @dataclass(frozen=True)
@@ -192,7 +190,7 @@ def rollout_rate(scene: Scene, weights: Weights, temperature_k: float, stretch: 
     fastest_s = max(min(min(both) for both in passed), 1e-6)
     name = weights.path.stem if shipped_weights().get(weights.path.stem) == weights.path else str(weights.path)
     ps_per_s = replicas * weights.model.n_new * lag_ps / fastest_s / stretch
-    return Rolls(name, lag_ps, ps_per_s, replicas, relaxation_ps, weights.domain.chemistry is not None)
+    return Rolls(name, lag_ps, ps_per_s, replicas, relaxation_ps)
 
 
 def _slowest_ps(files: list[Path]) -> float:

@@ -190,11 +190,10 @@ def _with_frames(folder: Path, paths: list[Path]) -> tuple[str, ...]:
 
 
 def _train(site: Site, record: RunRecord) -> RunRecord:
-    rates, decision = _rates_and_decision(record)
+    _, decision = _rates_and_decision(record)
     options = TrainOptions(
-        level=site.options.level, start_from=rates.rolls.weights if rates.rolls and rates.rolls.general else None,
-        budget_s=decision.seconds("train"), seed=site.options.seed, resume=True, quiet=True,
-    )  # fmt: skip
+        level=site.options.level, budget_s=decision.seconds("train"), seed=site.options.seed, resume=True, quiet=True
+    )
     train(site.scene, site.folder / WEIGHTS_NAME, options=options)
     return _rolling(site, record) or record
 
