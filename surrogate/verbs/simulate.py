@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from md_reference.campaign.manifest import COMPLETE, FAILED, campaign_folder, read_manifest
-from md_reference.forces.spec import ForceFieldSpec, at_level
+from md_reference.forces.spec import QUANTUM, ForceFieldSpec, at_level
 from md_reference.run.config import MDConfig, resolve_settings, resolved, to_config
 from surrogate.models.architecture import weights_path
 from surrogate.progress import progress_bar
@@ -24,6 +24,7 @@ from surrogate.verbs.options import (
     RolloutOptions,
     tell,
 )
+from systems.errors import InputError
 from systems.files.whole_file import replica_paths
 from systems.options import options_as_keywords, part_of
 from systems.scene import Scene
@@ -188,6 +189,8 @@ def rollout(
     else:
         loaded = load_weights(file)
         check_conditions(loaded.domain.conditions, conditions, loaded.path.name)
+    if options.level == "mm" and loaded.domain.conditions.get("force_field") == QUANTUM:
+        raise InputError(f"{loaded.path.name} is of {QUANTUM}; leave `level` out, or ask for that.")
     saved_ps = choose_lag(loaded, config.lag_ps, None) if config.save_every_ps is None else config.save_every_ps
     # The verb counts the frames of one replica; all advance together.
     ps_per_frame = saved_ps * len(files[0])

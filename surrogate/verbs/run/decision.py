@@ -161,8 +161,8 @@ def _choose(rates: Rates, budget_s: float, way: str) -> tuple[Way, tuple[str, ..
     if rates.rolls is not None:
         errors = expected_errors(rates, budget_s)
         best = min(error for name, error in errors.items() if "rollout" in name)
-        # Where both come to little, an expensive reference comes to less.
-        pays = best - 1e-9 * rates.expensive < errors["MD from many starts"]
+        by_md = errors["MD from many starts"]
+        pays = best < by_md or (rates.expensive and best == by_md)  # where neither comes to anything
         said = ", ".join(f"{100 * error:.2g} % by {name}" for name, error in errors.items())
         why = (rates.coverage, f"error to expect of a population: {said}, with {rates.relaxation_words}")
         return "rollout" if pays or way == "surrogate" else "md", why

@@ -6,13 +6,15 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+import torch
 
 from surrogate.api import info, rollout
 from surrogate.models import architecture
 from surrogate.models.weights import Chemistry, Weights, load_weights, read_header, save_weights
 from surrogate.sampling import domain as coverage
 from surrogate.sampling.domain import choose_weights, match_domain
-from systems.errors import OutOfDomainError
+from surrogate.sampling.simulation import LearnedForces
+from systems.errors import InputError, OutOfDomainError
 from systems.library.named_scenes import prepare
 from systems.trajectory.codec import open_trajectory
 
@@ -103,3 +105,17 @@ def test_a_molecule_on_which_they_agree_is_rolled(
         choose_weights(prepare("smiles:CNC(C)=O"), conditions={"force_field": "gfn2-xtb"})
     with pytest.raises(OutOfDomainError, match="The nearest: strict, where its level is asked for: `level='gfn2-xtb'`"):
         choose_weights(prepare("smiles:CNC(C)=O"))
+
+
+def test_forces_are_those_of_the_molecule_that_is_asked_about(general: Weights) -> None:
+    scene = prepare("smiles:CNC(C)=O")
+    energy, forces = LearnedForces(scene, general.path)(scene.positions_nm)
+    molecule = general.model.featurise(scene)
+    expected = general.model.evaluate(torch.tensor(scene.positions_nm)[None], molecule)
+    assert energy == pytest.approx(float(expected.energy_kj_mol), abs=0.01)
+    assert forces == pytest.approx(expected.forces_kj_mol_nm[0].numpy(), abs=0.5)
+
+
+def test_a_potential_is_not_taken_for_a_force_field(tmp_path: Path, general: Weights) -> None:
+    with pytest.raises(InputError, match="is of gfn2-xtb; leave `level` out"):
+        rollout("smiles:CNC(C)=O", general.path, tmp_path / "out.h5", time_ps="1ps", level="mm", quiet=True)
