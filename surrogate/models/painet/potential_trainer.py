@@ -123,8 +123,7 @@ _ROUND = 1e-8
 # Held-out states at which the error is measured again and again, at most.
 _MEASURED = 500
 _OWN_STEP_PS = 0.0005
-# Learning rates beside a new network's where weights are tuned: they know most of it (a minute on an unseen drug-like
-# molecule: 0.64 kcal/mol/Å at a fifth, 0.80 at the whole, 0.67 at a twentieth).
+# Learning rates beside a new network's where weights are tuned: they know most of it.
 _TUNING_RATE = 0.2
 # Frames of cheap MD, at the own temperature and at the hottest each, on which it is measured how far frames move.
 _MOVING_FRAMES = 200
