@@ -11,6 +11,7 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from md_reference.forces.forcefield import build_system
 from md_reference.forces.mixture import is_water, molecules_of
@@ -49,6 +50,7 @@ _TURN_EVERY = 3
 # Bonds of hot states are stretched, which a potential must learn; those longer than this, in radii, are broken.
 _BROKEN = 1.6
 _worker: Potential | None = None
+BoolArray = npt.NDArray[np.bool_]
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,11 +75,11 @@ class Labeller(Closing):
         self._potential = Potential(scene)
         check_minimum(scene)  # what the method refuses is known before anything runs
         self.n_rearranged = 0
-        n_workers = workers or available_cores()
+        self.n_workers = workers or available_cores()
         self._pool: Any = None
-        if n_workers > 1:
+        if self.n_workers > 1:
             context = multiprocessing.get_context("spawn")
-            self._pool = context.Pool(n_workers, _start, (scene.to_dict(),))
+            self._pool = context.Pool(self.n_workers, _start, (scene.to_dict(),))
 
     def close(self) -> None:
         """End the processes."""
@@ -90,14 +92,9 @@ class Labeller(Closing):
         """Return energies and forces at states `(n, n_atoms, 3)` nm; those without an answer are left out, as are those
         of another molecule."""
         asked = np.asarray(positions_nm, dtype=np.float64)
-        turned = changed_stereo(self.scene, asked)
-        same = [not t and not changed_bond(self.scene, x, stretch=_BROKEN) for x, t in zip(asked, turned, strict=True)]
-        states = asked[np.array(same, dtype=bool)]
+        states = asked[self._is_same(asked)]
         self.n_rearranged += len(asked) - len(states)
-        if self._pool is None:
-            answers = [_answer(state, self._potential) for state in states]
-        else:
-            answers = self._pool.map(_answer, states, chunksize=4)
+        answers = self._answers(states)
         good = [(x, *answer) for x, answer in zip(states, answers, strict=True) if answer is not None]
         shape = (len(good), self.scene.n_atoms, 3)
         kept, energies, forces = ([row[part] for row in good] for part in range(3))
@@ -105,6 +102,24 @@ class Labeller(Closing):
         return Labels(
             np.array(kept).reshape(shape), np.array(energies), np.array(forces).reshape(shape), n_failed, n_rearranged
         )
+
+    def energies(self, positions_nm: FloatArray) -> FloatArray:
+        """Return the energy `(n,)` in kJ/mol of every state, infinity where there is none or it is another molecule."""
+        asked = np.asarray(positions_nm, dtype=np.float64)
+        found, same = np.full(len(asked), np.inf), self._is_same(asked)
+        found[same] = [np.inf if answer is None else answer[0] for answer in self._answers(asked[same])]
+        return found
+
+    def _is_same(self, states: FloatArray) -> BoolArray:
+        """Return which states are no other molecule."""
+        turned = changed_stereo(self.scene, states)
+        return np.array([not t and not changed_bond(self.scene, x, stretch=_BROKEN)
+                         for x, t in zip(states, turned, strict=True)], dtype=bool)  # fmt: skip
+
+    def _answers(self, states: FloatArray) -> list[tuple[float, FloatArray] | None]:
+        if self._pool is None:
+            return [_answer(state, self._potential) for state in states]
+        return list(self._pool.map(_answer, states, chunksize=4))
 
     def explore(self, n_states: int, temperatures_k: Sequence[float], *, seed: int) -> FloatArray:
         """Return states `(n, n_atoms, 3)` nm of hot MD by GAFF2 (`rough`, see `gaff.entry`), or by GFN2-xTB where GAFF2

@@ -91,27 +91,33 @@ class Equilibrium:
         seen = self.crossings >= _LEAST_CROSSINGS or not len(self.timescales)
         return self.method == "plain averages" or (self.flat and self.ck_holds and seen)
 
-    def shares(self, micro: Sequence[IntArray], labels: Sequence[IntArray], n: int) -> tuple[FloatArray, FloatArray]:
+    def shares(
+        self, micro: Sequence[IntArray], labels: Sequence[IntArray], n: int, factors: Sequence[FloatArray] | None = None
+    ) -> tuple[FloatArray, FloatArray]:
         """Return the equilibrium share `(n,)` of each label and its bootstrap draws `(n_draws, n)`.
 
-        `micro`: what `equilibrium` was given; `labels`: a label 0 to n - 1 for each frame, -1 for none.
+        `micro`: what `equilibrium` was given; `labels`: a label 0 to n - 1 for each frame, -1 for none; `factors`: by
+        which each frame counts in another law than it was made by, NaN where that is not known.
         """
         n_micro = len(self.populations)
-        counts = np.zeros((len(self.unit_of), n_micro, n))
+        counts = np.zeros((2, len(self.unit_of), n_micro, n))
         for u, (k, start, stop) in enumerate(self.unit_of):
-            weighted = self.weights[k][start:stop] > 0
-            m, s = micro[k][start:stop][weighted], labels[k][start:stop][weighted]
-            known = (m >= 0) & (s >= 0)
-            counts[u] = np.bincount(m[known] * n + s[known], minlength=n_micro * n).reshape(n_micro, n)
-        draws = [_spread(p, np.tensordot(r, counts, 1)) for p, r in zip(self.draws, self.resampled, strict=True)]
-        return _spread(self.populations, counts.sum(0)), np.array(draws).reshape(-1, n)
+            m, s = micro[k][start:stop], labels[k][start:stop]
+            by = np.ones(len(m)) if factors is None else factors[k][start:stop]
+            known = (self.weights[k][start:stop] > 0) & (m >= 0) & (s >= 0) & np.isfinite(by)
+            cells = m[known] * n + s[known]
+            for of, each in zip(counts, (by[known], None), strict=True):
+                of[u] = np.bincount(cells, each, minlength=n_micro * n).reshape(n_micro, n)
+        draws = [_spread(p, *np.tensordot(counts, r, (1, 0))) for p, r in zip(self.draws, self.resampled, strict=True)]
+        return _spread(self.populations, *counts.sum(1)), np.array(draws).reshape(-1, n)
 
 
-def _spread(populations: FloatArray, counts: FloatArray) -> FloatArray:
-    """Return populations of labels from those of microstates `(n_micro,)` and counts `(n_micro, n)`."""
-    total = counts.sum(1)
+def _spread(populations: FloatArray, weighted: FloatArray, counts: FloatArray) -> FloatArray:
+    """Return populations of labels from those of microstates `(n_micro,)`, and the weight and the number of frames
+    `(n_micro, n)`."""
+    total = counts.sum(1)[:, None]
     with np.errstate(invalid="ignore", divide="ignore"):
-        found = np.nansum(populations[:, None] * np.where(total[:, None] > 0, counts / total[:, None], np.nan), axis=0)
+        found = np.nansum(populations[:, None] * np.where(total > 0, weighted / total, np.nan), axis=0)
     norm = found.sum()
     return np.asarray(found / norm if norm > 0 else found)
 

@@ -1,7 +1,8 @@
 """MD's answer: states, free energies, maps and timescales of a molecule from many MD replicas, errors from MD alone.
 
 Torsions -> TICA (kinetic map) -> k-means -> reversible Markov model (`surrogate.comparison.markov`). What is reported
-are states that a chemist names: α, β and left-handed of each residue, and the wells of every other torsion.
+are states that a chemist names: α, β and left-handed of each residue, and the wells of every other torsion. Frames of
+a learned potential serve as well, where the energies of its reference say how much each of them counts.
 """
 
 from __future__ import annotations
@@ -38,6 +39,8 @@ _APART, _LEAST_APART = 2.5, 0.02
 _CONTRADICTS = 4.0
 # What a surrogate is taken to be off by in the population of a state: weights keep no such number.
 MODEL_ERROR = 0.1
+# Fewer effective frames (Kish) of a rollout that is reweighted tell no populations.
+_LEAST_EFFECTIVE = 50.0
 # A state that has a smaller share of a rollout is no reason to begin there.
 _DRAWN_SHARE = 2e-3
 
@@ -76,7 +79,9 @@ class StateEnergy:
 
 @dataclass(frozen=True, eq=False)
 class Answer:
-    """What MD says of a molecule. `weights`: of every frame, an array a replica; `lag_ps` between frames;
+    """What MD says of a molecule, or a learned potential's rollout that its reference's energies reweight: `energies`
+    says of how many frames, and how many are effective. `weights`: of every frame, an array a replica; `lag_ps` between
+    frames;
     `timescales_ps` with `timescale_errors_ps`, descending; `states`; `maps`: for each residue the free energy in kJ/mol
     `(36, 36)` over φ and ψ, from -180°, infinity where MD never was; `has_images`: whether each replica counts with its
     mirror image; `missing`: what it cannot tell."""
@@ -95,6 +100,20 @@ class Answer:
     maps: dict[str, FloatArray]
     missing: tuple[str, ...]
     weights: tuple[FloatArray, ...]
+    energies: tuple[int, float] = (0, 0.0)
+
+    @property
+    def is_reweighted(self) -> bool:
+        return self.energies[0] > 0
+
+    @property
+    def whose(self) -> str:
+        """Whose populations these are, before the noun."""
+        return "the reweighted" if self.is_reweighted else "MD's"
+
+    @property
+    def _theirs(self) -> str:
+        return f"{self.whose} ones" if self.is_reweighted else self.whose
 
     @property
     def is_sure(self) -> bool:
@@ -106,7 +125,7 @@ class Answer:
         """Whether the surrogate's populations are the better answer for now: MD's errors are larger than what a
         surrogate is taken to be off by, and MD contradicts it nowhere."""
         both = [s for s in self.states if s.surrogate is not None and not s.missing]
-        if not both or any(s.is_apart(_APART if self.is_sure else _CONTRADICTS) for s in both):
+        if not both or self.is_reweighted or any(s.is_apart(_APART if self.is_sure else _CONTRADICTS) for s in both):
             return False
         by_md, rolled = (math.sqrt(sum(e * e for e in errors) / len(both))
                          for errors in ([s.error for s in both], [s.surrogate_error or 0.0 for s in both]))  # fmt: skip
@@ -120,11 +139,17 @@ class Answer:
             use = "Use the surrogate's populations for now, not MD's."
             what = f"For {len(weighted)} states, to about {100 * MODEL_ERROR:.0f} % (assumed); "
             what += "MD does not contradict them."
+        elif not self.states and self.holds:
+            use, what = f"Use {self.whose} frames.", "For the distribution of all torsions: each has a single state."
         elif not self.is_sure:
-            use, what = "Do not use MD's populations yet.", f"They show which states there are: {len(self.states)}."
+            use, what = (
+                f"Do not use {self.whose} populations yet.",
+                f"They show which states there are: {len(self.states)}.",
+            )
         else:
             widest = 100 * max((s.error for s in weighted), default=0.0)
-            use = "Use MD's answer" + (", but for what it did not connect." if self.missing else ".")
+            use = "Use the reweighted rollout" if self.is_reweighted else "Use MD's answer"
+            use += ", but for what it did not connect." if self.missing else "."
             what = f"For populations and free energies of {len(weighted)} states, each to {widest:.2g} % or better"
             what += " (one standard error)" + (", and relaxation times." if self.timescales_ps else ".")
         missing = f" Missing: {'; '.join(self.missing)}." if self.missing and not self.is_by_surrogate else ""
@@ -138,7 +163,12 @@ class Answer:
             not_yet = f" and off by up to {100 * max(s.error for s in weighted):.2g} %"
         else:
             not_yet = "" if self.is_sure else " and has not converged"
-        return use, what + missing, f"Why: MD is {length}, weighed by {self.tests}{not_yet}{slow}."
+        by = f"MD is {length}, weighed by {self.tests}"
+        if self.is_reweighted:
+            asked, effective = self.energies
+            by = f"the rollout is {length}, weighed by {self.tests} and by its reference's energies at {asked} frames, "
+            by += f"of which {effective:.0f} are effective"
+        return use, what + missing, f"Why: {by}{not_yet}{slow}."
 
     @property
     def on_surrogate(self) -> str:
@@ -150,13 +180,13 @@ class Answer:
         if not off:
             widest = max(s.error for s in weighted)
             return (
-                f"The surrogate's populations agree with MD's in all {len(weighted)} states, within errors of up to "
-                f"{100 * widest:.2g} %."
+                f"The surrogate's populations agree with {self._theirs} in all {len(weighted)} states, within errors "
+                f"of up to {100 * widest:.2g} %."
             )
         worst = off[0]
         instead = f"{100 * (worst.surrogate or 0.0):.3g} % instead of {percent(worst.share, worst.error)}"
         return (
-            f"The surrogate's populations differ from MD's in {len(off)} of {len(weighted)} states, most in "
+            f"The surrogate's populations differ from {self._theirs} in {len(off)} of {len(weighted)} states, most in "
             f"{worst.torsion} {worst.state}: {instead}."
         )
 
@@ -167,7 +197,7 @@ class Answer:
         maps = {k: [[x if math.isfinite(x) else None for x in row] for row in m.tolist()] for k, m in self.maps.items()}
         own = {
             "in_short": list(self.in_short),
-            "populations_by": "surrogate" if self.is_by_surrogate else "MD",
+            "populations_by": "surrogate" if self.is_by_surrogate else "reweighting" if self.is_reweighted else "MD",
             "on_surrogate": self.on_surrogate,
             "states": states,
             "maps_kj_mol": maps,
@@ -234,12 +264,16 @@ def _is_its_mirror_image(scene: Scene) -> bool:
     return True
 
 
-def md_answer(md: Ensemble, temperature_k: float, *, surrogate: Ensemble | None = None, seed: int = 0) -> Answer:
+def md_answer(
+    md: Ensemble, temperature_k: float, *, surrogate: Ensemble | None = None,
+    factors: Sequence[FloatArray] | None = None, seed: int = 0,
+) -> Answer:  # fmt: skip
     """Return what MD replicas say of equilibrium, and how a surrogate's populations compare with that.
 
-    `md`: one segment a replica; `temperature_k` of its bath. Of a small molecule that is its own mirror image each
-    replica counts with its mirror image, as long as MD connects the two. Raises InputError where no torsion of the
-    molecule turns or replicas are too short to tell anything.
+    `md`: one segment a replica; `temperature_k` of its bath; `factors`: what each frame counts at the law of a
+    reference, exp(-(U_reference - U_model) / kT) up to a constant, NaN where the reference was not asked. Of a small
+    molecule that is its own mirror image each replica counts with its mirror image, as long as MD connects the two.
+    Raises InputError where no torsion of the molecule turns or replicas are too short to tell anything.
     """
     torsions = _Torsions(md)
     if not len(torsions.quads):
@@ -250,12 +284,13 @@ def md_answer(md: Ensemble, temperature_k: float, *, surrogate: Ensemble | None 
         found = equilibrium(micro, n_own=len(of_md), seed=seed)
         if not found.unconnected:
             break
+    counting = None if factors is None else [*factors] * (len(micro) // len(of_md))
     own = torsions.of(surrogate) if surrogate is not None else None
     states: list[StateEnergy] = []
     missing: list[str] = []
     named = _named_states(torsions, angles, own)
     for name, labels, names, rolled in named:
-        states += _energies(found, micro, (name, names), labels, rolled, temperature_k)
+        states += _energies(found, micro, (name, names), labels, rolled, temperature_k, counting)
     for lost in found.unconnected:
         # What is left for good has no weight, rightly.
         if lost.fate != "left and never entered":
@@ -267,7 +302,13 @@ def md_answer(md: Ensemble, temperature_k: float, *, surrogate: Ensemble | None 
     ]
     if found.method == "Markov model" and not missing and found.crossings == 0 and len(found.timescales):
         missing.append("the slowest process was seen in one direction only")
-    ps = md.lag_ps
+    ps, asked, weights = md.lag_ps, (0, 0.0), found.weights
+    if factors is not None and counting is not None:
+        known = np.concatenate([f[np.isfinite(f)] for f in factors])
+        asked = len(known), float(known.sum() ** 2 / np.square(known).sum())
+        weights = _reweighted(found, micro, counting)
+        if asked[1] < _LEAST_EFFECTIVE:
+            missing.append(f"only {asked[1]:.0f} of {asked[0]} frames are effective, the surrogate is too far off")
     return Answer(
         method=found.method,
         n_replicas=found.n_own,
@@ -278,12 +319,22 @@ def md_answer(md: Ensemble, temperature_k: float, *, surrogate: Ensemble | None 
         timescale_errors_ps=tuple((found.timescale_errors * ps).tolist()),
         tests=_tests(found, ps),
         has_images=found.n_own < len(micro),
-        holds=found.holds,
+        holds=found.holds and (factors is None or asked[1] >= _LEAST_EFFECTIVE),
         states=tuple(states),
-        maps=_maps(torsions, angles, found.weights, temperature_k),
+        maps=_maps(torsions, angles, weights, temperature_k),
         missing=tuple(dict.fromkeys(missing)),
-        weights=with_mean_one(found.weights[: found.n_own]),
+        weights=with_mean_one(weights[: found.n_own]),
+        energies=asked,
     )
+
+
+def _reweighted(found: Equilibrium, micro: list[IntArray], factors: Sequence[FloatArray]) -> tuple[FloatArray, ...]:
+    """Return the weights of frames with `factors`; those that have none count by the others of their microstate."""
+    every, w, f = np.concatenate(micro), np.concatenate(found.weights), np.concatenate(factors)
+    n = len(found.populations) + 1
+    whole, asked = (np.bincount(every % n, of, n) for of in (w, w * np.isfinite(f)))  # -1, for none, is the last
+    scale = np.divide(whole, asked, out=np.zeros(n), where=asked > 0)
+    return tuple(w * np.nan_to_num(f) * scale[m] for w, f, m in zip(found.weights, factors, micro, strict=True))
 
 
 def _tests(found: Equilibrium, ps: float) -> str:
@@ -349,12 +400,12 @@ def _named_states(torsions: _Torsions, angles: list[FloatArray], own: list[Float
 
 def _energies(
     found: Equilibrium, micro: list[IntArray], named: tuple[str, tuple[str, ...]], labels: list[IntArray],
-    rolled: list[IntArray] | None, temperature_k: float,
+    rolled: list[IntArray] | None, temperature_k: float, factors: Sequence[FloatArray] | None,
 ) -> list[StateEnergy]:  # fmt: skip
     """Return the states of one torsion with their free energies."""
     torsion, names = named
     n = len(names)
-    shares, draws = found.shares(micro, labels, n)
+    shares, draws = found.shares(micro, labels, n, factors)
     kt = GAS_CONSTANT_KJ_MOL_K * temperature_k
     best = int(np.argmax(shares))
     n_frames = sum(map(len, labels))
@@ -397,7 +448,7 @@ def _said_missing(state: StateEnergy) -> StateEnergy:
     if state.n_replicas == 0:
         return replace(state, missing="only the surrogate was there; no MD began there")
     begun = f"{state.n_begun} replicas began there" if state.n_begun else "it was entered"
-    return replace(state, missing=f"not connected: {begun}, and MD shows no way out and back")
+    return replace(state, missing=f"not connected: {begun}, and no way out and back was seen")
 
 
 def _own_shares(labels: list[IntArray], n: int) -> tuple[FloatArray, FloatArray]:

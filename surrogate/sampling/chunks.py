@@ -83,10 +83,12 @@ class ChunkSampler:
         self._fit = fitted_atoms(template)
         self._target = template.positions_nm - template.positions_nm[self._fit].mean(axis=0)
 
-    def at(self, temperature_k: float) -> ChunkSampler:
-        """Return this sampler of a potential at another temperature, in NVT."""
+    def at(self, temperature_k: float, n_new: int) -> ChunkSampler:
+        """Return this sampler of a potential at another temperature, in NVT, for chunks of `n_new` frames."""
         other = copy.copy(self)
-        other._model = cast(Potential, self._model).in_bath({"temperature_k": temperature_k, "ensemble": "nvt"})
+        other.n_new = n_new
+        bath = {"temperature_k": temperature_k, "ensemble": "nvt", "n_new": n_new}
+        other._model = cast(Potential, self._model).in_bath(bath)
         return other
 
     @property

@@ -127,6 +127,7 @@ def _n_amino_acids(scene: Scene) -> int:
 
 # Copies of a molecule and chunks of MD on a potential by which its members are asked whether they know it.
 _ASKED_COPIES, _ASKED_CHUNKS = 16, 2
+_doubts_of: dict[tuple[object, ...], tuple[Deviation, ...]] = {}
 
 
 def cover_molecule(scene: Scene, domain: TrainingDomain, known: Chemistry) -> tuple[TrainingDomain, list[Deviation]]:
@@ -269,7 +270,11 @@ def match_domain(
         return match
     model = in_step(weights, scene).model
     assert isinstance(model, PainetPotential)
-    found = match._replace(deviations=(*match.deviations, *_doubts(scene, model, known)))
+    asked = weights.hash, known, model.config.timestep_ps, scene.topology_hash, scene.positions_nm.tobytes()
+    if asked not in _doubts_of:  # one command asks several times, for seconds each
+        _doubts_of.clear()
+        _doubts_of[asked] = _doubts(scene, model, known)
+    found = match._replace(deviations=(*match.deviations, *_doubts_of[asked]))
     return _refused(scene, found, weights.domain, name, force=force)
 
 

@@ -434,9 +434,10 @@ def _annealed(plan: Plan, usual: ChunkSampler, start: npt.NDArray[np.float32],
     config, frames = plan.weights.model.config, start
     falling = np.geomspace(max(HOT_K, config.temperature_k), config.temperature_k, ANNEAL_STAGES - HOT_STAGES + 1)
     stages = [falling[0]] * (HOT_STAGES - 1) + list(falling)
-    chunks = max(1, round(plan.config.anneal_ps / len(stages) / (config.n_new * config.lag_ps)))
+    n_frames = max(1, round(plan.config.anneal_ps / len(stages) / config.lag_ps))
+    chunks = -(-n_frames // config.n_new)
     for stage, temperature_k in enumerate(stages):
-        sampler = usual.at(float(temperature_k))
+        sampler = usual.at(float(temperature_k), -(-n_frames // chunks))
         velocities = None
         for k in range(chunks):
             if asked_to_stop():

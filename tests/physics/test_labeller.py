@@ -54,6 +54,15 @@ def test_states_without_an_answer_are_left_out_and_counted() -> None:
     np.testing.assert_array_equal(found.positions_nm, states[:1])
 
 
+def test_every_state_has_an_energy_and_another_molecule_an_infinite_one() -> None:
+    scene = scene_from_smiles("CO")
+    states = np.repeat(scene.positions_nm[None], 3, axis=0)
+    states[1, -1] += 0.2  # the hydroxyl's hydrogen
+    with Labeller(scene, workers=1) as labeller:
+        found = labeller.energies(states)
+    assert found[0] == found[2] == pytest.approx(Potential(scene)(scene.positions_nm)[0]) and np.isposinf(found[1])
+
+
 def test_states_of_another_molecule_are_left_out_and_counted() -> None:
     scene = scene_from_smiles("NCC(=O)O")
     moved, stretched = scene.positions_nm.copy(), scene.positions_nm.copy()

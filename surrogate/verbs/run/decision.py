@@ -13,7 +13,7 @@ from systems.errors import InputError
 from systems.units import format_time_ps, format_wall
 
 Way = Literal["md", "rollout", "potential"]
-Stage = Literal["train", "rollout", "md", "held-out md", "report"]
+Stage = Literal["train", "rollout", "energies", "md", "held-out md", "report"]
 
 
 class Plan(NamedTuple):
@@ -23,13 +23,17 @@ class Plan(NamedTuple):
     shares: dict[Stage, float]
 
 
+# A rollout's frames are reweighted by energies of an expensive reference, one of which costs as much as a step of MD.
+# Some time goes into MD where that comes to so many ps; below it would tell nothing.
+_REWEIGHTED: dict[Stage, float] = {"rollout": 0.8, "energies": 0.2}
+_MD_BESIDE, _LEAST_MD_PS = 0.3, 50.0
 # MD without a surrogate is compared with itself: it is split by replicas, or by stages if there is one replica.
 PLANS: dict[Way, Plan] = {
     "md": Plan("MD for the whole budget", {"md": 1.0}),
     "rollout": Plan("a rollout finds the states, MD from its frames weighs them", {"rollout": 0.1, "held-out md": 0.9}),
     "potential": Plan(
-        "a potential that learns from GFN2-xTB finds the states, MD weighs them",
-        {"train": 0.6, "rollout": 0.1, "held-out md": 0.3},
+        "a potential that learns from GFN2-xTB finds the states, GFN2-xTB's energies weigh them",
+        {"train": 0.6, "rollout": 0.2, "energies": 0.05, "held-out md": 0.15},
     ),
 }
 _BY_STAGES: dict[Stage, float] = {"md": 0.5, "held-out md": 0.5}
@@ -108,7 +112,7 @@ def decide(
     return replace(
         found,
         save_every_ps=save_every_ps or _interval(rates, chosen, max(sum(md), rolled_ps) / most),
-        equilibrate_ps=_EQUILIBRATION_SHARE * min(md) / rates.replicas,
+        equilibrate_ps=_EQUILIBRATION_SHARE * min(md, default=0.0) / rates.replicas,
         expected_md_ps=sum(md),
         expected_rollout_ps=rolled_ps,
     )
@@ -123,7 +127,9 @@ def _shares(rates: Rates, way: Way, budget_s: float, left_s: float) -> dict[Stag
     if way != "rollout" or rates.rolls is None:
         return shares
     if rates.expensive:
-        return {"rollout": _MOST_ROLLED, "held-out md": 1.0 - _MOST_ROLLED}
+        beside = _MD_BESIDE if _MD_BESIDE * left_s * rates.md_ps_per_s >= _LEAST_MD_PS else 0.0
+        found: dict[Stage, float] = {name: (1.0 - beside) * share for name, share in _REWEIGHTED.items()}
+        return {**found, "held-out md": beside} if beside else found
     errors = expected_errors(rates, budget_s)
     if errors["a rollout alone"] >= errors["MD from rollout frames"]:
         return shares
@@ -242,7 +248,9 @@ def table(rates: Rates, decision: Decision, budget_s: float) -> dict[str, str]:
         lines["by SIMD"] = rates.without_simd
     if (rolls := rates.rolls) is not None:
         lines["by rollout"] = f"{per_day(rolls.ps_per_s)}, {rolls.replicas} replicas of {rolls.weights}"
-    lines |= {"way": PLANS[decision.way].words, "because": "; ".join(decision.why)}
+    reweighted = decision.seconds("energies") and decision.way == "rollout"
+    words = "a rollout whose frames the reference's energies weigh" if reweighted else PLANS[decision.way].words
+    lines |= {"way": words, "because": "; ".join(decision.why)}
     for name, seconds in ((stage.name, stage.seconds) for stage in decision.stages):
         lines[name] = format_wall(seconds)
         to_come_ps = decision.expected_rollout_ps if name == "rollout" else md_ps(rates, decision, name)

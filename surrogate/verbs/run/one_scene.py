@@ -33,7 +33,16 @@ from surrogate.verbs.run.decision import (
     table,
 )
 from surrogate.verbs.run.rates import by_openmm, measure
-from surrogate.verbs.run.run_record import RUN_NAME, RunRecord, StageEntry, read_run, settings_of_run, write_run
+from surrogate.verbs.run.run_record import (
+    ANSWER_NAME,
+    ENERGIES_NAME,
+    RUN_NAME,
+    RunRecord,
+    StageEntry,
+    read_run,
+    settings_of_run,
+    write_run,
+)
 from surrogate.verbs.run.stages import STAGES, Site, md_options
 from surrogate.verbs.simulate import resolve_run
 from systems.errors import InputError, SimulationError, SurromdError
@@ -305,7 +314,9 @@ def _taken_up(record: RunRecord, options: RunOptions) -> RunRecord:
     if longer.way != record.decision.way:  # a surrogate that failed
         return record
     decision = replace(longer, why=record.decision.why, equilibrate_ps=record.decision.equilibrate_ps)
-    ended = tuple(entry for entry in record.stages if entry.status == "done" and entry.name != "report")
+    ended = tuple(
+        entry for entry in record.stages if entry.status == "done" and entry.name not in ("energies", "report")
+    )
     return replace(record, decision=decision, stages=ended, outcome=None, settings=settings_of_run(options))
 
 
@@ -370,7 +381,7 @@ def _clear(folder: Path) -> None:
     """Remove what an earlier run wrote, its record last."""
     for name in ("reference", "trajectory"):
         shutil.rmtree(folder / name, ignore_errors=True)
-    for pattern in ("report.*", "weights.*", "equilibrium.json", LOG_NAME, RUN_NAME):
+    for pattern in ("report.*", "weights.*", ANSWER_NAME, ENERGIES_NAME, LOG_NAME, RUN_NAME):
         for path in folder.glob(pattern):
             with suppress(FileNotFoundError):
                 path.unlink()

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 RUN_NAME, ANSWER_NAME, REPORT_NAME = "run.json", "equilibrium.json", "report.html"
+ENERGIES_NAME = "energies.csv"
 FORMAT = 4
 # What may change from one sitting to the next.
 _FREE = frozenset({"quiet", "resume", "overwrite", "dry_run", "workers", "scheduler"})

@@ -18,14 +18,15 @@ import numpy.typing as npt
 
 from md_reference.run.config import MDConfig
 from surrogate.comparison.md_answer import Answer, frames_over_states, md_answer
-from surrogate.comparison.read.ensemble import STOPPED, load_ensemble
+from surrogate.comparison.read.ensemble import STOPPED, Ensemble, load_ensemble
 from surrogate.comparison.verdict import LEAST_SAMPLES
+from surrogate.models.architecture import weights_path
 from surrogate.verbs.compare import compare
 from surrogate.verbs.inputs import summarised_outputs
 from surrogate.verbs.options import MDSettings, ReferenceOptions, RolloutOptions, RunOptions, TrainOptions
 from surrogate.verbs.run.decision import Decision, Stage, Way, md_ps, table
 from surrogate.verbs.run.rates import Rates, rollout_rate
-from surrogate.verbs.run.run_record import ANSWER_NAME, REPORT_NAME, Outcome, RunRecord
+from surrogate.verbs.run.run_record import ANSWER_NAME, ENERGIES_NAME, REPORT_NAME, Outcome, RunRecord
 from surrogate.verbs.simulate import rollout
 from surrogate.verbs.train import train
 from systems.errors import InputError, SimulationError
@@ -51,11 +52,13 @@ _ANNEAL_PS, _ANNEAL = 50.0, 0.2
 _STARTING, _LEAST_STARTS = 0.15, 4
 # Runs of one scene whose seeds differ by this are independent, replicas and all.
 _SEEDS_APART = 10_000
-# Of a run's report, where MD's frames have weights.
+# Of a run's report, where frames have weights.
 UNWEIGHTED = (
-    "This comparison counts all frames of held-out MD alike; the weights that MD's transitions give them are in the "
-    "lines on top, in the maps below them and in the files."
+    "This comparison counts all frames alike; their weights at equilibrium are in the lines on top, in the maps below "
+    "them and in the files."
 )
+# Of the time for energies of frames, so that they are written before it is up.
+_ASKING = 0.9
 WEIGHTS_NAME = "weights.safetensors"
 
 
@@ -258,6 +261,24 @@ def _rolled(site: Site, record: RunRecord) -> RunRecord | None:
     return replace(record, trajectory=files) if files else None
 
 
+def _ask(site: Site, record: RunRecord) -> RunRecord:
+    """Ask the reference for energies of the rollout's frames."""
+    from surrogate.models.weights import load_weights
+    from surrogate.verbs.run.single_points import ask_reference
+
+    _, decision = _rates_and_decision(record)
+    own = site.folder / WEIGHTS_NAME
+    weights = load_weights(own if record.weights == WEIGHTS_NAME else weights_path(record.weights))
+    rolled = load_ensemble([site.folder / file for file in record.trajectory])
+    seconds = _ASKING * decision.seconds("energies")
+    ask_reference(site.scene, weights, rolled, site.folder, seconds, site.options.seed)
+    return record
+
+
+def _asked(site: Site, record: RunRecord) -> RunRecord | None:
+    return record if (site.folder / ENERGIES_NAME).is_file() else None
+
+
 # ---- the report ----------------------------------------------------------------------------------------------------
 
 
@@ -275,17 +296,21 @@ class Costs:
 
 
 def outcome(
-    way: Way, comparison: Comparison, costs: Costs, answer: Answer | None = None, notes: tuple[str, ...] = ()
-) -> Outcome:
-    """Return what a run comes to: its MD's `answer`, and a comparison of its trajectory with its held-out MD."""
+    way: Way, comparison: Comparison, costs: Costs, answer: Answer | None = None, notes: tuple[str, ...] = (), *,
+    by_itself: bool = False,
+) -> Outcome:  # fmt: skip
+    """Return what a run comes to: its `answer`, and a comparison of its trajectory with its held-out MD; `by_itself`:
+    with other replicas of the same rollout."""
     evaluated = comparison.evaluations[0]
     held = [comparison.reference, *([] if comparison.replicate is None else [comparison.replicate])]
     found = None
-    if evaluated.equivalent_time_words:
+    if evaluated.equivalent_time_words and not by_itself:
         found = next((each for each in evaluated.equivalent_time if each.kind == "distribution"), None)
     rolled, speed_up = _length([evaluated.summary]), None
     said = f"{rolled} of the surrogate" if way != "md" else f"{rolled} of MD, evaluated by {_length(held)}"
-    if found is None:
+    if by_itself:
+        said += f", compared with {_length(held)} of the same rollout: {evaluated.status}."
+    elif found is None:
         said += f": {evaluated.status}, without an equivalent MD time."
     else:
         said += f": equivalent to {found.in_words()} of MD by its {found.measure}."
@@ -295,11 +320,13 @@ def outcome(
     lines = evaluated.in_short if answer is None else answer.in_short
     on_surrogate = answer.on_surrogate if answer else ""
     if answer is not None and on_surrogate and not answer.is_sure and not answer.is_by_surrogate:
-        on_surrogate = "MD has not converged, and cannot say whether the surrogate's populations are right."
+        what = "The rollout" if answer.is_reweighted else "MD"
+        on_surrogate = f"{what} has not converged, and cannot say whether the surrogate's populations are right."
     return Outcome(
         headline=" ".join(lines), in_short=lines,
-        details=" ".join(filter(None, (on_surrogate, said, _remedy(comparison, costs)))),
-        status=evaluated.status, verdict=evaluated.verdict, held_out_ps=sum(a.total_ps for a in held),
+        details=" ".join(filter(None, (on_surrogate, said, "" if by_itself else _remedy(comparison, costs)))),
+        status=evaluated.status, verdict=evaluated.verdict,
+        held_out_ps=0.0 if by_itself else sum(a.total_ps for a in held),
         rolled_ps=evaluated.summary.total_ps, equivalent_time=found.in_words() if found else "", speed_up=speed_up,
         on_surrogate=on_surrogate, converged=answer.holds and not answer.missing if answer else False, notes=notes,
     )  # fmt: skip
@@ -310,7 +337,7 @@ def lines_of(way: Way, evaluated: Evaluation, answer: Answer | None) -> tuple[st
     counts all frames of MD alike, and MD's transitions weigh them."""
     if answer is None or evaluated.status == "broken":
         return evaluated.in_short
-    if way == "md" or answer.is_by_surrogate:
+    if way == "md" or answer.is_by_surrogate or answer.is_reweighted:
         return answer.in_short
     rolled = [s for s in answer.states if s.surrogate is not None and not s.missing]
     off = [s for s in rolled if s.differs]
@@ -395,12 +422,18 @@ def answer_of(site: Site, record: RunRecord) -> Answer | None:
     """Return what all MD of a run says of equilibrium, written into its folder, each frame's weight into its file; None
     where it tells nothing."""
     is_md = _rates_and_decision(record)[1].way == "md"
-    files = [site.folder / file for file in (*(record.trajectory if is_md else ()), *record.held_out)]
-    rolled = None if is_md else load_ensemble([site.folder / file for file in record.trajectory])
-    md = load_ensemble(files, template=None if rolled is None else rolled.scene)
-    try:
-        answer = md_answer(md, site.config.temperature_k, surrogate=rolled, seed=site.options.seed)
-    except InputError:
+    frames = [site.folder / file for file in record.trajectory]
+    rolled = None if is_md else load_ensemble(frames)
+    answer = None if rolled is None else _reweighted(site, rolled)
+    files = frames
+    held_out = [*(frames if is_md else ()), *(site.folder / file for file in record.held_out)]
+    if held_out and (answer is None or not answer.is_sure):
+        md = load_ensemble(held_out, template=None if rolled is None else rolled.scene)
+        with suppress(InputError):
+            by_md = md_answer(md, site.config.temperature_k, surrogate=rolled, seed=site.options.seed)
+            if answer is None or by_md.is_sure:
+                answer, files = by_md, held_out
+    if answer is None:
         return None
     if len(answer.weights) == len(files):
         for path, weights in zip(files, answer.weights, strict=True):
@@ -409,22 +442,53 @@ def answer_of(site: Site, record: RunRecord) -> Answer | None:
     return answer
 
 
+def _reweighted(site: Site, rolled: Ensemble) -> Answer | None:
+    """Return what a rollout says at the law of its reference; None where that was not asked, or no torsion turns."""
+    from surrogate.verbs.run.single_points import differences, factors_of
+
+    known = differences(site.folder, rolled.segment_lengths)
+    if not any(np.isfinite(d).any() for d in known):
+        return None
+    temperature_k = site.config.temperature_k
+    with suppress(InputError):
+        return md_answer(
+            rolled, temperature_k, surrogate=rolled, factors=factors_of(known, temperature_k), seed=site.options.seed
+        )
+    return None
+
+
+def _compared(held: list[Path], candidate: list[Path], label: str) -> Comparison:
+    ref, other = (held, None) if len(held) < 2 else (held[: len(held) // 2], held[len(held) // 2 :])
+    return compare(ref, [candidate], replicate=other, labels=[label])
+
+
 def _report(site: Site, record: RunRecord) -> RunRecord:
     from surrogate.comparison.report.figures import weighted_maps
     from surrogate.comparison.report.report import Foreword, write_report
 
     rates, decision = _rates_and_decision(record)
-    if not record.held_out or not record.trajectory:
+    is_reweighted = _asked(site, record) is not None and len(record.trajectory) > 1
+    if not record.trajectory or not (record.held_out or is_reweighted):
         lacking = "the trajectory" if record.held_out else "MD to compare it with"
         raise InputError(f"{lacking} came to nothing in its time; `resume=True` with a longer `budget_s` goes on.")
     answer = answer_of(site, record)
-    held = [site.folder / file for file in record.held_out]
-    ref, other = (held, None) if len(held) < 2 else (held[: len(held) // 2], held[len(held) // 2 :])
-    label = "MD" if decision.way == "md" else "surrogate"
-    comparison = compare(ref, [[site.folder / file for file in record.trajectory]], replicate=other, labels=[label])
-    held_ps = comparison.reference.total_ps + (comparison.replicate.total_ps if comparison.replicate else 0.0)
+    held, rolled = ([site.folder / file for file in files] for files in (record.held_out, record.trajectory))
     notes = tuple(f"{entry.name}: {entry.note}" for entry in record.stages if entry.note)
-    found = outcome(decision.way, comparison, costs_of(record, comparison, held_ps), answer, notes)
+    label = "MD" if decision.way == "md" else "surrogate"
+    comparison = None
+    if held:
+        try:
+            comparison = _compared(held, rolled, label)
+        except InputError as error:
+            if not is_reweighted:
+                raise
+            notes = (*notes, f"MD is not compared with: {error}")
+    by_itself = comparison is None
+    if comparison is None:
+        comparison = _compared(rolled[: len(rolled) // 2], rolled[len(rolled) // 2 :], label)
+    held_ps = comparison.reference.total_ps + (comparison.replicate.total_ps if comparison.replicate else 0.0)
+    costs = costs_of(record, comparison, held_ps)
+    found = outcome(decision.way, comparison, costs, answer, notes, by_itself=by_itself)
     evaluated = comparison.evaluations[0]
     evaluated = replace(evaluated, in_short=lines_of(decision.way, evaluated, answer))
     said = (*(() if answer is None else (UNWEIGHTED,)), *notable(comparison.notes))
@@ -449,5 +513,6 @@ STAGES: dict[str, StageOf] = {
     "held-out md": _md_stage("held-out md", "reference/held_out", 1),
     "train": StageOf(_train, _trained, may_fail=True),
     "rollout": StageOf(_roll, _rolled, may_fail=True),
+    "energies": StageOf(_ask, _asked, may_fail=True),
     "report": StageOf(_report, lambda site, record: None),
 }

@@ -118,6 +118,36 @@ def test_a_state_that_no_md_leaves_is_missing_not_invented(forms: np.ndarray) ->
     assert sum(float(w.sum()) for w in answer.weights) == pytest.approx(32 * 300)
 
 
+def test_a_rollout_is_reweighted_by_the_energies_of_its_reference(forms: np.ndarray) -> None:
+    """The rollout jumps by MATRIX; its reference has the left-handed state 4.98 kJ/mol lower, two kT."""
+    states = jumps(MATRIX, [0, 0, 1, 2] * 8, 400, 3)
+    lower = np.where(states == 2, 2.0, 0.0)
+    asked = np.random.default_rng(4).random(states.shape) < 0.3
+    factors = [*np.where(asked, np.exp(lower), np.nan)]
+    right = POPULATIONS * np.exp([0.0, 0.0, 2.0])
+    right /= right.sum()
+    answer = md_answer(ensemble(forms, states), 300.0, surrogate=ensemble(forms, states), factors=factors)
+    n, effective = answer.energies
+    assert n == asked.sum() and effective == pytest.approx(
+        np.exp(lower[asked]).sum() ** 2 / np.exp(2 * lower[asked]).sum()
+    )
+    for state, share in zip(answer.states, right, strict=True):
+        assert abs(state.share - share) < 3.0 * state.error + 0.01 and state.error < 0.08
+    left = answer.states[2]
+    assert (
+        left.differs and left.surrogate == pytest.approx(0.1, abs=0.06) and "the reweighted ones" in answer.on_surrogate
+    )
+    # Weights of frames are those of the states; frames that were not asked weigh nothing.
+    weights = np.array(answer.weights)
+    assert not weights[~asked].any() and weights.mean() == pytest.approx(1.0)
+    share = np.bincount(states.ravel(), weights.ravel(), minlength=3) / weights.sum()
+    assert share == pytest.approx([s.share for s in answer.states], abs=0.01)
+    wrong = md_answer(ensemble(forms, states), 300.0, factors=[1.0 / f for f in factors])
+    assert not any(s.share > 0.05 for s in wrong.states if s.state == "left-handed"), "negative control: the sign"
+    few = [np.where(np.arange(400) < 1, f, np.nan) for f in np.exp(lower)]
+    assert not md_answer(ensemble(forms, states), 300.0, factors=few).holds
+
+
 def test_weights_make_plain_histograms_right(forms: np.ndarray) -> None:
     states = jumps(MATRIX, [2] * 32, 250, 7)
     answer = md_answer(ensemble(forms, states), 300.0)

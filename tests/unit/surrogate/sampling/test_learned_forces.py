@@ -115,6 +115,7 @@ def test_annealed_replicas_start_all_over(tmp_path: Path, monkeypatch: pytest.Mo
     loaded = load_weights(weights_path("paracetamol-gfn2-xtb"))
     scene, methyl = loaded.domain.scene, [11, 0, 1, 2]
     asked: list[float] = []
+    frames: list[int] = []
 
     def rolled(name: str, anneal_ps: float) -> Any:
         outs = [tmp_path / f"{name}_r{k}.h5" for k in range(3)]
@@ -126,9 +127,10 @@ def test_annealed_replicas_start_all_over(tmp_path: Path, monkeypatch: pytest.Mo
 
     at = runner.ChunkSampler.at
 
-    def at_asked(self: Any, temperature_k: float) -> Any:
+    def at_asked(self: Any, temperature_k: float, n_new: int) -> Any:
         asked.append(temperature_k)
-        return at(self, temperature_k)
+        frames.append(n_new)
+        return at(self, temperature_k, n_new)
 
     monkeypatch.setattr(runner.ChunkSampler, "at", at_asked)
     still = rolled("still", 0.0)
@@ -136,6 +138,9 @@ def test_annealed_replicas_start_all_over(tmp_path: Path, monkeypatch: pytest.Mo
     turned = rolled("turned", 10.0)
     assert np.abs(turned).max() > 90.0
     assert asked[:3] == [600.0] * 3 and asked[-1] == pytest.approx(300.0) and (np.diff(asked[2:]) < 0.0).all()
+    frames.clear()
+    rolled("shortly", 2.0)
+    assert frames == [2] * 10, "of 0.1 ps, not a whole chunk each"
     # One that flies apart starts as it was.
     draw = runner.ChunkSampler.draw
     calls = iter(range(100))

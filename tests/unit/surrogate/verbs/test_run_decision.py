@@ -131,10 +131,14 @@ def test_dear_reference_is_learned_where_there_is_time_to() -> None:
     assert decide(EXPENSIVE, 3600.0, "md").way == "md"
 
 
-def test_weights_that_cover_a_molecule_roll_half_of_the_time_where_forces_are_expensive() -> None:
+def test_where_forces_are_expensive_energies_of_frames_take_the_place_of_md_that_would_tell_nothing() -> None:
     covered = replace(EXPENSIVE, rolls=Rolls("drug-like-gfn2-xtb", 0.1, 100.0, 32))
     found = decide(covered, 60.0)
-    assert found.way == "rollout" and found.seconds("rollout") == found.seconds("held-out md") > 20.0
+    assert found.way == "rollout" and named(found) == ["rollout", "energies", "report"]
+    assert found.seconds("rollout") == pytest.approx(4.0 * found.seconds("energies")) and found.equilibrate_ps == 0.0
+    assert "reference's energies weigh" in table(covered, found, 60.0)["way"]
+    longer = decide(covered, 3600.0)
+    assert named(longer) == ["rollout", "energies", "held-out md", "report"] and longer.expected_md_ps > 50.0
 
 
 def test_the_least_budget_that_is_named_is_enough_although_measuring_took_some_of_it() -> None:

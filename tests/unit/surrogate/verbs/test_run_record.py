@@ -127,12 +127,14 @@ def evaluation(found: EquivalentTime | None, status: str = "close") -> Any:
                            in_short=("Use it.", "Right: all.", "Why: so."))  # fmt: skip
 
 
-def told(way: Way, found: EquivalentTime | None, costs: Costs = CHEAP, answer: Any = None, of: Any = None) -> Outcome:
+def told(
+    way: Way, found: EquivalentTime | None, costs: Costs = CHEAP, answer: Any = None, of: Any = None, **more: Any
+) -> Outcome:
     half, evaluated = summary(6_000.0, 16), evaluation(found, "close" if found else "undecided")
     comparison: Any = SimpleNamespace(
         evaluations=(evaluated,), reference=half, replicate=half, convergence=of or convergence()
     )
-    return outcome(way, comparison, costs, answer)
+    return outcome(way, comparison, costs, answer, **more)
 
 
 def state(**more: Any) -> StateEnergy:
@@ -224,6 +226,27 @@ def test_the_lines_over_the_comparison_agree_with_md_s_answer() -> None:
     assert "90 % instead of 50.0 ± 1.0 %" in why
     assert lines_of("rollout", evaluated, answer(holds=False))[0].startswith("Not known yet")
     assert lines_of("rollout", evaluation(None, "broken"), answer())[0] == "Use it.", "the comparison's own words"
+
+
+def test_a_reweighted_rollout_is_the_answer_and_claims_no_md() -> None:
+    reweighted = answer(energies=(1000, 300.4))
+    found = told("rollout", equivalent_time(), answer=reweighted, by_itself=True)
+    assert found.in_short[0] == "Use the reweighted rollout."
+    assert "by its reference's energies at 1000 frames, of which 300 are effective" in found.in_short[2]
+    assert not found.equivalent_time and found.speed_up is None and found.held_out_ps == 0.0
+    assert (
+        "16 replicas of 3.1 ns of the surrogate, compared with 32 replicas of 380 ps of the same rollout: close."
+        in (found.details)
+    )
+    assert "agree with the reweighted ones in all 2 states" in found.on_surrogate
+    assert reweighted.to_dict()["populations_by"] == "reweighting" and not reweighted.is_by_surrogate
+    assert lines_of("rollout", evaluation(None), reweighted) == reweighted.in_short
+    unsure = told("rollout", None, answer=answer(energies=(1000, 20.0), holds=False), by_itself=True)
+    assert (
+        unsure.in_short[0] == "Do not use the reweighted populations yet." and "The rollout has not" in unsure.details
+    )
+    single = answer(states=(), energies=(10, 9.0))
+    assert single.in_short[0] == "Use the reweighted frames." and answer(states=()).in_short[0] == "Use MD's frames."
 
 
 def test_costs_are_of_training_and_rolling_beside_the_faster_md() -> None:

@@ -7,6 +7,7 @@ from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from quick_report import evaluated_at_once
@@ -15,7 +16,7 @@ from surrogate.verbs.run import one_scene, run_scenes, stages
 from surrogate.verbs.run.rates import Rates, Rolls
 from surrogate.verbs.run.run_scenes import molecules_in, write_results
 from systems.errors import InputError, SimulationError
-from systems.trajectory.codec import open_trajectory
+from systems.trajectory.codec import frame_weights, open_trajectory
 
 # As if a second of MD made a tenth of a ps: 150 ps a replica in ten minutes, which are over in a second.
 SLOW = Rates(22, 2, 1.0, False, "OBC2", 25e-6, 0.004, 0.2, "trained on it", Rolls("alanine-dipeptide", 1.0, 1.0))
@@ -184,3 +185,18 @@ def test_the_table_links_each_report_and_takes_names_as_text(tmp_path: Path) -> 
     page = (tmp_path / "index.html").read_text("utf-8")
     assert 'href="%3Cb%3E/report.html">&lt;b&gt;' in page and "1.2 ns" in page and "no &amp; such" in page
     assert json.loads((tmp_path / "results.json").read_text())[0] == line
+
+
+@pytest.mark.slow
+def test_at_quantum_level_the_answer_is_a_rollout_reweighted_by_the_reference(tmp_path: Path) -> None:
+    pytest.importorskip("tblite")
+    folder = tmp_path / "run"
+    found = api.run("smiles:OCCO", folder, level="gfn2-xtb", budget_s=60.0, quiet=True)
+    assert [stage["name"] for stage in found["stages"]] == ["rollout", "energies", "report"]
+    assert found.answer["populations_by"] == "reweighting" and found.answer["energies"][0] > 50
+    assert found.answer["in_short"][0] in (folder / "report.html").read_text("utf-8") and not found["held_out"]
+    weights = np.concatenate([frame_weights(path) for path in found.trajectory])
+    asked = len((folder / "energies.csv").read_text().splitlines()) - 1
+    assert 0 < np.count_nonzero(weights) <= asked and weights.mean() == pytest.approx(1.0)
+    api.run("smiles:OCCO", folder, level="gfn2-xtb", budget_s=80.0, resume=True, quiet=True)
+    assert len((folder / "energies.csv").read_text().splitlines()) - 1 > asked

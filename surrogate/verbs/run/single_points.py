@@ -1,0 +1,89 @@
+"""Energies of an expensive reference at frames of a potential's rollout: by these its frames follow the reference's own
+law, at the cost of a single point for what costs MD thousands of steps."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from md_reference.run.labeller import Labeller
+from surrogate.comparison.measure.statistics import FloatArray
+from surrogate.comparison.read.ensemble import Ensemble
+from surrogate.models.potential import Potential
+from surrogate.models.propagator import Molecule
+from surrogate.models.weights import Weights
+from surrogate.sampling.domain import match_known
+from surrogate.verbs.run.run_record import ENERGIES_NAME
+from systems.chemistry.validity import INVALID
+from systems.errors import InputError
+from systems.files.whole_file import create_whole
+from systems.interrupts import stop_if_asked
+from systems.scene import Scene
+from systems.units import GAS_CONSTANT_KJ_MOL_K
+
+_COLUMNS = "replica,frame,difference_kj_mol"
+# Frames that a core computes before the clock is looked at again.
+_TOGETHER = 16
+
+
+def ask_reference(scene: Scene, weights: Weights, rolled: Ensemble, folder: Path, seconds: float, seed: int) -> None:
+    """Write U_reference - U_model, kJ/mol, of as many frames as `seconds` allow into `folder`: valid ones drawn at
+    random, none that is there already.
+
+    Frames that the reference has no energy for, or that are another molecule, get infinity. Raises InputError where
+    time is too short for any, PreparationError for what the reference refuses.
+    """
+    until = time.monotonic() + seconds
+    model = weights.model
+    assert isinstance(model, Potential)
+    match = match_known(scene, weights.domain, weights.path.name)
+    molecule = Molecule.of(weights.domain.scene if match.seen else scene)
+    flags = rolled.flags or [np.zeros(n, dtype=np.uint16) for n in rolled.segment_lengths]
+    found = differences(folder, rolled.segment_lengths)
+    frames = [
+        (k, int(t)) for k, f in enumerate(flags) for t in np.flatnonzero(((f & INVALID) == 0) & np.isnan(found[k]))
+    ]
+    order = np.random.default_rng(seed).permutation(len(frames))
+    try:
+        with Labeller(scene) as reference:
+            n = _TOGETHER * reference.n_workers
+            for first in range(0, len(order), n):
+                stop_if_asked()
+                if time.monotonic() > until:
+                    break
+                batch = [frames[i] for i in order[first : first + n]]
+                x = np.array([rolled.segments[k][t] for k, t in batch], dtype=np.float64)
+                with torch.no_grad():
+                    own = model.energies(torch.from_numpy(x[:, match.order]), molecule).mean(-1).numpy()
+                for (k, t), difference in zip(batch, reference.energies(x) - own, strict=True):
+                    found[k][t] = difference
+    finally:  # what was asked is kept, also where its time was up
+        if any(np.isfinite(f).any() for f in found):
+            _write(folder, found)
+    if not any(np.isfinite(f).any() for f in found):
+        raise InputError("GFN2-xTB has no energy of any frame of the rollout in its time.")
+
+
+def _write(folder: Path, found: list[FloatArray]) -> None:
+    rows = [f"{k},{t},{f[t]:.6f}" for k, f in enumerate(found) for t in np.flatnonzero(~np.isnan(f)).tolist()]
+    create_whole(folder / ENERGIES_NAME, "\n".join([_COLUMNS, *rows]) + "\n")
+
+
+def differences(folder: Path, lengths: list[int]) -> list[FloatArray]:
+    """Return the differences in a folder, an array of `lengths` a replica, NaN for frames that were not asked for."""
+    found = [np.full(n, np.nan) for n in lengths]
+    if (folder / ENERGIES_NAME).is_file():
+        rows = np.loadtxt(folder / ENERGIES_NAME, delimiter=",", skiprows=1, ndmin=2)
+        for k, values in enumerate(found):
+            own = rows[(rows[:, 0] == k) & (rows[:, 1] < len(values))]
+            values[own[:, 1].astype(int)] = own[:, 2]
+    return found
+
+
+def factors_of(differences_kj_mol: list[FloatArray], temperature_k: float) -> list[FloatArray]:
+    """Return what each frame counts, exp(-difference / kT), the greatest 1; NaN stays, and infinity counts nothing."""
+    least = min(float(np.nanmin(d)) for d in differences_kj_mol if np.isfinite(d).any())
+    return [np.exp((least - d) / (GAS_CONSTANT_KJ_MOL_K * temperature_k)) for d in differences_kj_mol]

@@ -1,0 +1,87 @@
+"""Energies of a reference at frames of a potential's rollout: which frames, what is kept, and the sign."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from md_reference.forces.quantum import Potential
+from surrogate.comparison.read.ensemble import Ensemble
+from surrogate.models.architecture import shipped_weights
+from surrogate.models.painet.energy import PainetPotential
+from surrogate.models.propagator import Molecule
+from surrogate.models.weights import Weights, load_weights
+from surrogate.verbs.run import single_points
+from surrogate.verbs.run.run_record import ENERGIES_NAME
+from surrogate.verbs.run.single_points import ask_reference, differences, factors_of
+from systems.chemistry.validity import CHIRALITY
+from systems.errors import InputError
+from systems.interrupts import stop_when
+from systems.library.named_scenes import prepare
+from systems.scene import Scene
+
+pytest.importorskip("tblite")
+
+
+@pytest.fixture(scope="module")
+def general() -> Weights:
+    return load_weights(shipped_weights()["drug-like-gfn2-xtb"])
+
+
+@pytest.fixture(scope="module")
+def scene() -> Scene:
+    return prepare("smiles:CO")
+
+
+def rolled(scene: Scene, n: int = 6) -> Ensemble:
+    rng = np.random.default_rng(0)
+    frames = [
+        (scene.positions_nm + 0.002 * rng.normal(size=(n, scene.n_atoms, 3))).astype(np.float32) for _ in range(2)
+    ]
+    flags = [np.zeros(n, dtype=np.uint16) for _ in range(2)]
+    flags[1][3] = CHIRALITY
+    return Ensemble("surrogate", frames, 1.0, scene, flags=flags)
+
+
+def test_every_valid_frame_has_the_reference_s_energy_less_the_potential_s(
+    tmp_path: Path, scene: Scene, general: Weights
+) -> None:
+    frames = rolled(scene)
+    ask_reference(scene, general, frames, tmp_path, 60.0, 0)
+    assert isinstance(general.model, PainetPotential)
+    own = general.model.energies(torch.from_numpy(frames.segments[0].astype(np.float64)), Molecule.of(scene)).mean(-1)
+    right = [Potential(scene)(x.astype(np.float64))[0] for x in frames.segments[0]] - own.detach().numpy()
+    found = differences(tmp_path, frames.segment_lengths)
+    assert found[0] == pytest.approx(right, abs=1e-4)
+    assert np.isnan(found[1]).tolist() == [k == 3 for k in range(6)], "an invalid frame is not asked for"
+    factors = factors_of(found, 300.0)
+    energies = -0.0083144626 * 300.0 * np.log(factors[0])
+    assert energies - energies[0] == pytest.approx(found[0] - found[0][0], abs=1e-6)
+    assert np.nanmax(np.concatenate(factors)) == 1.0
+    # More frames are asked for, those that are known stay.
+    before = (tmp_path / ENERGIES_NAME).read_text().splitlines()
+    ask_reference(scene, general, rolled(scene, 8), tmp_path, 60.0, 1)
+    after = (tmp_path / ENERGIES_NAME).read_text().splitlines()
+    assert set(before) < set(after) and len(after) == len(before) + 4
+
+
+def test_what_was_asked_before_the_time_was_up_is_kept(
+    tmp_path: Path, scene: Scene, general: Weights, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(single_points, "_TOGETHER", 1)
+    calls = iter(range(100))
+    with pytest.raises(KeyboardInterrupt), stop_when(lambda: next(calls) > 2):
+        ask_reference(scene, general, rolled(scene, 40), tmp_path, 600.0, 0)
+    found = np.concatenate(differences(tmp_path, [40, 40]))
+    assert 0 < np.isfinite(found).sum() < 79
+    with pytest.raises(InputError, match="no energy of any frame"):
+        ask_reference(scene, general, rolled(scene), tmp_path / "none", -1.0, 0)
+
+
+def test_a_frame_of_another_molecule_weighs_nothing() -> None:
+    factors = factors_of([np.array([1.0, np.inf, np.nan]), np.array([3.494, np.nan, np.nan])], 300.0)
+    assert factors[0][:2].tolist() == [1.0, 0.0] and np.isnan(factors[0][2])
+    assert factors[1][0] == pytest.approx(np.exp(-1.0), abs=1e-3)
