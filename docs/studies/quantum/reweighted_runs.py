@@ -1,0 +1,161 @@
+"""What `surromd run --level gfn2-xtb` knows after a few minutes, over the MD that the same minutes buy.
+
+    python docs/studies/quantum/reweighted_runs.py runs FOLDER [--minutes 5] [--molecules NAME ...]
+    python docs/studies/quantum/reweighted_runs.py table FOLDER [-o TABLE.json]
+
+`runs` spends the budget on each molecule twice, with two seeds, by the general potential that never saw it (paracetamol
+by its own weights, too), on the cores it may use; nothing else should run (`taskset -c 1` for one core). `table` takes
+cos and sin of every torsion that turns, folded by its symmetry, as observables f. A run states the mean of each at
+GFN2-xTB's law with an error s (jackknife over its replicas); MD of length T would know it to sqrt(2 tau Var f / T),
+with tau the integrated correlation time of f in the rollout, which moves as MD does. So a run is worth
+T = 2 tau Var f / s^2 of MD that has forgotten its start; the speed-up is that over what MD by GFN2-xTB, a replica a
+core, makes in the whole budget. `z`: root mean square difference of the two runs over their errors, 1 where errors are
+right.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+import surrogate as sm
+from md_reference.run.machine import machine_name
+from surrogate.comparison.measure.kinetics import zero_crossing
+from surrogate.comparison.measure.slow_motion import SLOW_KINDS
+from surrogate.comparison.measure.torsions import find_torsions
+from surrogate.comparison.read.ensemble import load_ensemble
+from surrogate.verbs.run.run_record import RUN_NAME, RunResult
+from systems.chemistry.geometry import torsion_angle
+
+FloatArray = npt.NDArray[np.float64]
+GENERAL = "drug-like-gfn2-xtb"
+# None was trained on, but paracetamol by its own weights.
+MOLECULES = {
+    "paracetamol": ("smiles:CC(=O)Nc1ccc(O)cc1", GENERAL),
+    "paracetamol, own weights": ("smiles:CC(=O)Nc1ccc(O)cc1", "paracetamol-gfn2-xtb"),
+    "aspirin": ("smiles:CC(=O)Oc1ccccc1C(=O)O", GENERAL),
+    "suprofen": ("smiles:CC(C(=O)O)c1ccc(C(=O)c2cccs2)cc1", GENERAL),
+    "ibuprofen": ("smiles:CC(C)Cc1ccc(C(C)C(=O)O)cc1", GENERAL),
+    "clopidogrel": ("smiles:COC(=O)[C@H](c1ccccc1Cl)N1CCc2sccc2C1", GENERAL),
+    "lidocaine": ("smiles:CCN(CC)CC(=O)Nc1c(C)cccc1C", GENERAL),
+}
+SEEDS = (0, 1)
+
+
+def make_runs(folder: Path, names: list[str], minutes: float) -> None:
+    """Run every molecule with both seeds; what is done is left alone, what was stopped goes on."""
+    for seed in SEEDS:
+        for name in names:
+            source, weights = MOLECULES[name]
+            out = folder / f"{name.replace(', ', '_').replace(' ', '_')}_{seed}"
+            is_there = (out / RUN_NAME).is_file()
+            if not (is_there and RunResult.of(out)["outcome"]):
+                sm.run(source, out, level="gfn2-xtb", weights=weights, budget_s=60.0 * minutes, seed=seed, quiet=True,
+                       resume=is_there)  # fmt: skip
+            said(f"{name}, seed {seed}: {RunResult.of(out).headline}")
+
+
+class Run:
+    """One run: observables `(replicas, frames, k)` of its rollout, weights `(replicas, frames)` at GFN2-xTB's law."""
+
+    def __init__(self, folder: Path) -> None:
+        self.result = RunResult.of(folder)
+        rolled = load_ensemble(self.result.trajectory)
+        torsions = [t for t in find_torsions(rolled.scene) if t.kind in SLOW_KINDS]
+        quads, fold = np.array([t.quad for t in torsions]), np.array([t.fold for t in torsions])
+        n = min(rolled.segment_lengths)
+        angles = [fold * torsion_angle(np.asarray(s[:n]).transpose(1, 2, 0), quads).T for s in rolled.segments]
+        self.lag_ps = rolled.lag_ps
+        self.f = np.array([np.concatenate([np.cos(a), np.sin(a)], axis=1) for a in angles])
+        self.w = np.array([sm.frame_weights(path)[:n] for path in self.result.trajectory])
+        self.asked, self.effective = self.result.answer["energies"]
+        sums, norm = np.einsum("rt,rtk->rk", self.w, self.f), self.w.sum(1)[:, None]
+        self.mean = sums.sum(0) / norm.sum()
+        without = (sums.sum(0) - sums) / (norm.sum() - norm)
+        r = len(without)
+        self.error = np.sqrt((r - 1) / r * np.square(without - without.mean(0)).sum(0))
+        self.variance = np.einsum("rt,rtk->k", self.w, np.square(self.f - self.mean)) / norm.sum()
+
+    def worth_ps(self) -> FloatArray:
+        """Return of how much MD each observable is worth."""
+        tau_ps = [self.lag_ps * zero_crossing(list(self.f[:, :, k]))[1] for k in range(self.f.shape[2])]
+        return np.asarray(2.0 * np.array(tau_ps) * self.variance / np.square(self.error))
+
+    @property
+    def md_ps(self) -> float:
+        """What MD makes in the whole budget."""
+        return float(self.result["rates"]["md_ps_per_s"]) * float(self.result["settings"]["budget_s"])
+
+
+def line(name: str, runs: list[Run]) -> tuple[list[str], float]:
+    """Return the cells of a molecule, and its speed-up: the mean of both runs' medians over observables."""
+    # What does not vary (sin of a mirror image) is no observable.
+    varies = np.all([r.variance > 1e-3 for r in runs], axis=0)
+    worth = [np.median((r.worth_ps() / r.md_ps)[varies]) for r in runs]
+    least = [np.min((r.worth_ps() / r.md_ps)[varies]) for r in runs]
+    a, b = runs
+    z = float(np.sqrt(np.mean(np.square((a.mean - b.mean)[varies]) / (a.error**2 + b.error**2)[varies])))
+    shares = ", ".join(f"{r.effective / r.asked:.0%} of {r.asked}" for r in runs)
+    rolled = float(np.mean([r["rolled_ps"] for r in (x.result["outcome"] for x in runs)])) * 2e-3
+    return [
+        name, str(a.result["rates"]["n_atoms"]), f"{rolled:.2g}", f"{np.mean([r.md_ps for r in runs]):.0f}", shares,
+        f"{max(np.max(r.error[varies]) for r in runs):.2g}", f"{z:.2g}",
+        f"{np.mean(worth):.2g} ({', '.join(f'{w:.2g}' for w in worth)})", f"{np.mean(least):.2g}",
+    ], float(np.mean(worth))  # fmt: skip
+
+
+def make_table(folder: Path, out: Path | None) -> None:
+    rows, gains = [], {}
+    for name in MOLECULES:
+        places = [folder / f"{name.replace(', ', '_').replace(' ', '_')}_{seed}" for seed in SEEDS]
+        if all((p / RUN_NAME).is_file() and RunResult.of(p)["outcome"] for p in places):
+            cells, gains[name] = line(name, [Run(p) for p in places])
+            rows.append(cells)
+            said(" | ".join(cells))
+    unseen = [gain for name, gain in gains.items() if not name.startswith("paracetamol")]
+    if not unseen:
+        raise SystemExit("there are no two runs of any molecule; make them first.")
+    said(f"median of {len(unseen)} molecules but paracetamol: {np.median(unseen):.2g}")
+    if out is not None:
+        settings = RunResult.of(next(p.parent for p in folder.glob(f"*/{RUN_NAME}")))
+        table = {
+            "command": "python docs/studies/quantum/reweighted_runs.py table FOLDER",
+            "machine": f"{machine_name()}, {settings['rates']['cores']} core(s) used",
+            "note": f"Budgets of {settings['settings']['budget_s'] / 60:g} min in all, two runs each. Median of all "
+                    f"but paracetamol: {np.median(unseen):.2g}.",
+            "columns": ["molecule", "atoms", "rolled, ns", "MD in as much time, ps", "effective of frames asked",
+                        "largest error", "z", "speed-up, median of observables (both runs)", "least"],
+            "rows": rows,
+        }  # fmt: skip
+        out.write_text(json.dumps(table, indent=1, ensure_ascii=False) + "\n")
+
+
+def said(text: str) -> None:
+    sys.stdout.write(text + "\n")
+    sys.stdout.flush()
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    verbs = parser.add_subparsers(dest="verb", required=True)
+    running, telling = verbs.add_parser("runs"), verbs.add_parser("table")
+    for part in (running, telling):
+        part.add_argument("folder", type=Path)
+    running.add_argument("--minutes", type=float, default=5.0)
+    running.add_argument("--molecules", nargs="+", default=list(MOLECULES), choices=list(MOLECULES))
+    telling.add_argument("-o", "--out", type=Path)
+    given = parser.parse_args()
+    if given.verb == "runs":
+        given.folder.mkdir(parents=True, exist_ok=True)
+        make_runs(given.folder, given.molecules, given.minutes)
+    else:
+        make_table(given.folder, given.out)
+
+
+if __name__ == "__main__":
+    main()
