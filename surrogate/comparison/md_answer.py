@@ -162,7 +162,9 @@ class Answer:
         if self.is_by_surrogate:
             not_yet = f" and off by up to {100 * max(s.error for s in weighted):.2g} %"
         else:
-            not_yet = "" if self.is_sure else " and has not converged"
+            not_yet = (
+                "" if self.is_sure else "; it has not converged" if self.is_reweighted else " and has not converged"
+            )
         by = f"MD is {length}, weighed by {self.tests}"
         if self.is_reweighted:
             asked, effective = self.energies

@@ -126,7 +126,8 @@ def make_rivals(folder: Path, names: Sequence[str], most_minutes: float) -> None
         scene, config, _ = resolve_run(prepare(MOLECULES[name][0]), options, {"time_ps": options.time_ps}, quiet=True)
         simulate_replicas(scene, config, [place / f"run_{k:03d}.h5" for k in range(n_replicas())], resume=True)
         rolls = rates[-1][0]["rolls"]
-        if rolls:
+        first = folder / name / "rollout" / "rolled_r0.h5"
+        if rolls and (checkpoint_path(first).exists() or not first.exists()):
             every_ps = max(EVERY_PS, rolls["lag_ps"])
             rolled_ps = max(rolled_length_ps(r, min(m, ROLLED_MINUTES)) for r, m in rates)
             time_ps = every_ps * math.ceil(rolled_ps / every_ps)

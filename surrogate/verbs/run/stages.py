@@ -59,6 +59,10 @@ UNWEIGHTED = (
 )
 # Of the time for energies of frames, so that they are written before it is up.
 _ASKING = 0.9
+BY_ITSELF = (
+    "Reference, replicate and candidate are replicas of one rollout: MD at this level would be too short to compare "
+    "with."
+)
 WEIGHTS_NAME = "weights.safetensors"
 
 
@@ -491,7 +495,11 @@ def _report(site: Site, record: RunRecord) -> RunRecord:
     found = outcome(decision.way, comparison, costs, answer, notes, by_itself=by_itself)
     evaluated = comparison.evaluations[0]
     evaluated = replace(evaluated, in_short=lines_of(decision.way, evaluated, answer))
-    said = (*(() if answer is None else (UNWEIGHTED,)), *notable(comparison.notes))
+    said = (
+        *((BY_ITSELF,) if by_itself else ()),
+        *(() if answer is None else (UNWEIGHTED,)),
+        *notable(comparison.notes),
+    )
     comparison = replace(comparison, notes=said, evaluations=(evaluated,))
     lines = [*(answer.table() if answer else ()), *table(rates, decision, site.options.budget_s).items()]
     write_report(
@@ -500,7 +508,7 @@ def _report(site: Site, record: RunRecord) -> RunRecord:
         command=f"surromd run {record.scene!r} -o {site.folder.name}",
         foreword=Foreword(
             "\n".join(found.in_short),
-            "States by MD, its equivalent MD time, and how the budget was spent",
+            "States, equivalent MD time, and how the budget was spent",
             [("equivalent_time", found.details), *lines, *(("note", note) for note in notes)],
             [] if answer is None else weighted_maps(answer.maps),
         ),

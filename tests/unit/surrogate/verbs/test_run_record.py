@@ -242,6 +242,7 @@ def test_a_reweighted_rollout_is_the_answer_and_claims_no_md() -> None:
     assert reweighted.to_dict()["populations_by"] == "reweighting" and not reweighted.is_by_surrogate
     assert lines_of("rollout", evaluation(None), reweighted) == reweighted.in_short
     unsure = told("rollout", None, answer=answer(energies=(1000, 20.0), holds=False), by_itself=True)
+    assert "are effective; it has not converged" in unsure.in_short[2]
     assert (
         unsure.in_short[0] == "Do not use the reweighted populations yet." and "The rollout has not" in unsure.details
     )
