@@ -102,6 +102,9 @@ def decide(
     budget_s *= _AIM
     at_all_s, of_frame_s = _report_s(rates)
     comparison_s = min(0.5 * budget_s, max(_REPORT_SHARE * budget_s, at_all_s + _LEAST_FRAMES * of_frame_s))
+    # Of what makes few frames it has less to read; half of its time is to spare.
+    n_frames = budget_s * max(rates.md_ps_per_s, rates.rolls.ps_per_s if rates.rolls else 0.0) / _base_ps(rates, chosen)
+    comparison_s = min(comparison_s, 2.0 * (at_all_s + n_frames * of_frame_s))
     most = int(min(_MOST_FRAMES, max(_LEAST_FRAMES, (comparison_s - at_all_s) / of_frame_s)))
     left_s = budget_s - comparison_s
     shares = _shares(rates, chosen, budget_s, left_s)
@@ -191,9 +194,14 @@ def _choose(rates: Rates, budget_s: float, way: str) -> tuple[Way, tuple[str, ..
 
 
 def _interval(rates: Rates, way: Way, least_ps: float) -> float:
-    """Return the interval between saved frames: a round multiple of what the surrogate, or else MD, steps by."""
-    base_ps = rates.rolls.lag_ps if rates.rolls and way != "md" else 0.1 if rates.expensive else 1.0
+    """Return the interval between saved frames: a round multiple of the shortest."""
+    base_ps = _base_ps(rates, way)
     return base_ps * next((n for n in _NICE if n * base_ps >= least_ps), _NICE[-1])
+
+
+def _base_ps(rates: Rates, way: Way) -> float:
+    """Return the shortest interval between saved frames: what the surrogate, or else MD, steps by."""
+    return rates.rolls.lag_ps if rates.rolls and way != "md" else 0.1 if rates.expensive else 1.0
 
 
 def expected_errors(

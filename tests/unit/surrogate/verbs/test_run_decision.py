@@ -137,6 +137,8 @@ def test_where_forces_are_expensive_energies_of_frames_take_the_place_of_md_that
     assert found.way == "rollout" and named(found) == ["rollout", "energies", "report"]
     assert found.seconds("rollout") == pytest.approx(4.0 * found.seconds("energies")) and found.equilibrate_ps == 0.0
     assert "reference's energies weigh" in table(covered, found, 60.0)["way"]
+    slow = replace(covered, rolls=Rolls("drug-like-gfn2-xtb", 0.1, 10.0, 32))
+    assert decide(slow, 600.0).seconds("report") < 0.5 * decide(COVERED, 600.0).seconds("report"), "few frames to read"
     longer = decide(covered, 3600.0)
     assert named(longer) == ["rollout", "energies", "held-out md", "report"] and longer.expected_md_ps > 50.0
 
