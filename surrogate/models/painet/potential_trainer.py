@@ -98,7 +98,12 @@ def domain_of(scene: Scene, samples: Samples, moving: list[Any], config: Potenti
     middles = [run[:, np.unique(moves.jump_idx)].mean(axis=1) for run in moving]
     drift_nm = max((np.linalg.norm(np.diff(m, axis=0), axis=-1).max(initial=0.0) for m in middles), default=0.0)
     jumps = {key: getattr(moves, key) for key in ("jump_idx", "jump_max_nm", "jump_min_nm")}
-    limits = replace(looks, **jumps, drift_max_nm=WIDENING * float(drift_nm))
+    # A few hundred samples are too few to know how far angles bend: cheap MD tells as well.
+    angles = {
+        "angle_min_rad": np.minimum(looks.angle_min_rad, moves.angle_min_rad),
+        "angle_max_rad": np.maximum(looks.angle_max_rad, moves.angle_max_rad),
+    }
+    limits = replace(looks, **jumps, **angles, drift_max_nm=WIDENING * float(drift_nm))
     geometry = geometry_from_frames(scene, quiet)
     return TrainingDomain(scene, config.lag_ps, conditions_of(config), geometry.to_dict(), limits.to_dict(), ())
 

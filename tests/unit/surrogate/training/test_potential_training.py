@@ -24,7 +24,7 @@ from surrogate.models.painet.potential_trainer import (
 from surrogate.models.propagator import Molecule, draw_noise
 from surrogate.models.weights import load_weights
 from surrogate.training import loop
-from systems.chemistry.validity import DRIFT, Limits, check_limits
+from systems.chemistry.validity import ANGLE, DRIFT, Limits, check_limits
 from systems.errors import InputError, SimulationError
 from systems.prepare.molecule import scene_from_smiles
 from systems.scene import Scene
@@ -224,6 +224,10 @@ def test_frames_may_move_as_far_as_those_of_hot_md() -> None:
     both = jumps(cold, hot)
     # Runs end where they end: from the last cold frame to the first hot one nothing moved.
     assert both == pytest.approx((jumps(cold)[0], jumps(hot)[1])) and both[1] > 5.0 * jumps(cold)[1]
+    # And angles bend as far: the samples, which are few, are cold.
+    flagged = [check_limits(hot, Limits.from_dict(domain_of(scene, samples, of, SMALL).limits), hot) & ANGLE > 0
+               for of in ([cold, hot], [cold])]  # fmt: skip
+    assert not flagged[0].any() and flagged[1].mean() > 0.9
     # Turned about only, nothing changes but for rounding, which is no more than is stated.
     assert jumps(np.stack([Rotation.random(rng=k).apply(cold[0]) for k in range(9)]))[1] < 1e-9
 
