@@ -157,12 +157,15 @@ def _cis_trans(positions_nm: FloatArray, neighbours: list[list[int]], colours: l
 # carbon that bears hydrogen to N or O: aldehydes 0.121, imines 0.128; in aromatic rings 0.132 and more. And the longest
 # step of MD at quantum level with such a bond.
 _TRIPLE_NM, _DOUBLE_NM, STIFF_STEP_PS = 0.1225, 0.130, 0.002
+# Of CH=CH: shorter than in rings with five delocalised bonds, and than in benzene.
+_VINYL_NM, _RING_NM = 0.136, 0.1385
 
 
 def has_stiff_bond(scene: Scene) -> bool:
     """Return whether MD with heavy hydrogens cannot take steps of 4 fs: for a bond that is triple or one of two double
     bonds of an atom (2,000 to 2,300 per cm), or for a double bond of a carbon that gave mass to its hydrogens: of
-    aldehydes, imines and =CH2. Orders, lengths and numbers of bonds tell."""
+    aldehydes, imines, =CH2 and CH=CH, in rings of furan's and thiazole's kind, too, but not in benzene's. Orders,
+    lengths and numbers of bonds tell."""
     degree, order = (
         np.bincount(scene.bonds.ravel(), weights=weights, minlength=scene.n_atoms)
         for weights in (None, np.repeat(scene.bond_orders, 2))
@@ -177,7 +180,14 @@ def has_stiff_bond(scene: Scene) -> bool:
     length = np.linalg.norm(scene.positions_nm[i] - scene.positions_nm[j], axis=-1)
     triple = (degree[i] <= 2) & (degree[j] <= 2) & (element[i] != "H") & (element[j] != "H") & (length < _TRIPLE_NM)
     double = (n_hydrogens[i] > 0) & (element[i] == "C") & np.isin(element[j], ("N", "O")) & (length < _DOUBLE_NM)
-    return bool((triple | double).any())
+    # Cyclohexene flies apart at 4 fs; furan's and thiazole's CH=CH vibrate 1.4 times as far as at 2 fs, pyrrole's not.
+    with_o, with_other = (
+        np.bincount(i[np.isin(element[j], of)], minlength=scene.n_atoms) for of in ("O", ("N", "O", "S"))
+    )
+    both = (element[i] == "C") & (element[j] == "C") & (n_hydrogens[i] > 0) & (n_hydrogens[j] > 0)
+    near_others = (with_o[i] > 0) | ((with_other[i] > 0) & (with_other[j] > 0))
+    both &= (degree[i] == 3) & (degree[j] == 3) & (length < np.where(near_others, _RING_NM, _VINYL_NM))
+    return bool((triple | double | both).any())
 
 
 def ring_sizes(graph: nx.Graph) -> dict[tuple[int, int], int]:
