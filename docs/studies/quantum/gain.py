@@ -90,7 +90,7 @@ def main() -> None:
     )  # fmt: skip
     speed = md_ps_per_s(scene, given.folder)
     report = given.folder / "report.html"
-    comparison = sm.compare(given.ref, [rolled], report, replicate=given.replicate, overwrite=True)
+    comparison = sm.compare(given.reference, [rolled], report, replicate=given.replicate, overwrite=True)
     evaluated = comparison.evaluations[0]
     training_s, rolled_ps = float(weights.provenance["training_s"]), evaluated.summary.total_ps
     rolling_s = evaluated.summary.wall_s or 0.0
