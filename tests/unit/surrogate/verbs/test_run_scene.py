@@ -191,12 +191,12 @@ def test_the_table_links_each_report_and_takes_names_as_text(tmp_path: Path) -> 
 def test_at_quantum_level_the_answer_is_a_rollout_reweighted_by_the_reference(tmp_path: Path) -> None:
     pytest.importorskip("tblite")
     folder = tmp_path / "run"
-    found = api.run("smiles:OCCO", folder, level="gfn2-xtb", budget_s=60.0, quiet=True)
+    found = api.run("smiles:OCCO", folder, level="gfn2-xtb", budget_s=45.0, quiet=True)
     assert [stage["name"] for stage in found["stages"]] == ["rollout", "energies", "report"]
     assert found.answer["populations_by"] == "reweighting" and found.answer["energies"][0] > 50
     assert found.answer["in_short"][0] in (folder / "report.html").read_text("utf-8") and not found["held_out"]
     weights = np.concatenate([frame_weights(path) for path in found.trajectory])
     asked = len((folder / "energies.csv").read_text().splitlines()) - 1
     assert 0 < np.count_nonzero(weights) <= asked and weights.mean() == pytest.approx(1.0)
-    api.run("smiles:OCCO", folder, level="gfn2-xtb", budget_s=80.0, resume=True, quiet=True)
+    api.run("smiles:OCCO", folder, level="gfn2-xtb", budget_s=60.0, resume=True, quiet=True)
     assert len((folder / "energies.csv").read_text().splitlines()) - 1 > asked
