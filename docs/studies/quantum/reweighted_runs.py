@@ -69,17 +69,27 @@ class Run:
         torsions = [t for t in find_torsions(rolled.scene) if t.kind in SLOW_KINDS]
         quads, fold = np.array([t.quad for t in torsions]), np.array([t.fold for t in torsions])
         n = min(rolled.segment_lengths)
-        angles = [fold * torsion_angle(np.asarray(s[:n]).transpose(1, 2, 0), quads).T for s in rolled.segments]
+        angles = [fold * torsion_angle(np.asarray(s[:n]).transpose(2, 1, 0), quads).T for s in rolled.segments]
         self.lag_ps = rolled.lag_ps
         self.f = np.array([np.concatenate([np.cos(a), np.sin(a)], axis=1) for a in angles])
         self.w = np.array([sm.frame_weights(path)[:n] for path in self.result.trajectory])
         self.asked, self.effective = self.result.answer["energies"]
-        sums, norm = np.einsum("rt,rtk->rk", self.w, self.f), self.w.sum(1)[:, None]
-        self.mean = sums.sum(0) / norm.sum()
-        without = (sums.sum(0) - sums) / (norm.sum() - norm)
-        r = len(without)
-        self.error = np.sqrt((r - 1) / r * np.square(without - without.mean(0)).sum(0))
-        self.variance = np.einsum("rt,rtk->k", self.w, np.square(self.f - self.mean)) / norm.sum()
+        # As in the answer: frames that were asked, weighted, less what these are off by without weights.
+        by_all, by_asked, weighted = (
+            self.without(w) for w in (np.ones_like(self.w), (self.w > 0).astype(float), self.w)
+        )
+        off, apart = (x - x.mean(0) for x in (by_asked - by_all, weighted))
+        b = np.clip((off * apart).sum(0) / np.square(off).sum(0), 0.0, 1.0)
+        each = weighted - b * (by_asked - by_all)
+        r = len(each)
+        self.mean, self.error = each.mean(0), np.sqrt((r - 1) / r * np.square(each - each.mean(0)).sum(0))
+        norm = self.w.sum()
+        self.variance = np.einsum("rt,rtk->k", self.w, np.square(self.f - self.mean)) / norm
+
+    def without(self, w: FloatArray) -> FloatArray:
+        """Return the means of f by some weights, each replica left out once, `(replicas, k)`."""
+        sums, norms = np.einsum("rt,rtk->rk", w, self.f), w.sum(1)[:, None]
+        return np.asarray((sums.sum(0) - sums) / (norms.sum() - norms))
 
     def worth_ps(self) -> FloatArray:
         """Return of how much MD each observable is worth."""

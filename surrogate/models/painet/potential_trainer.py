@@ -99,7 +99,7 @@ def domain_of(scene: Scene, samples: Samples, moving: list[Any], config: Potenti
     drift_nm = max((np.linalg.norm(np.diff(m, axis=0), axis=-1).max(initial=0.0) for m in middles), default=0.0)
     jumps = {key: getattr(moves, key) for key in ("jump_idx", "jump_max_nm", "jump_min_nm")}
     # A few hundred samples are too few to know how far angles bend: cheap MD tells as well.
-    angles = {
+    angles: dict[str, Any] = {
         "angle_min_rad": np.minimum(looks.angle_min_rad, moves.angle_min_rad),
         "angle_max_rad": np.maximum(looks.angle_max_rad, moves.angle_max_rad),
     }

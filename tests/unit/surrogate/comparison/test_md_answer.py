@@ -148,6 +148,32 @@ def test_a_rollout_is_reweighted_by_the_energies_of_its_reference(forms: np.ndar
     assert not md_answer(ensemble(forms, states), 300.0, factors=few).holds
 
 
+def test_all_frames_tell_by_how_much_those_that_were_asked_are_off(
+    forms: np.ndarray, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    states = jumps(np.full((3, 3), 1 / 3), [0, 1, 2, 0] * 8, 400, 3)
+    lower = np.where(states == 2, 0.5, 0.0)
+    right = np.exp([0.0, 0.0, 0.5]) / np.exp([0.0, 0.0, 0.5]).sum()
+
+    def answers(n: int) -> np.ndarray:
+        """Shares and errors `(n, 2, 3)` by one frame of a hundred, always another one."""
+        found = []
+        for seed in range(n):
+            asked = np.random.default_rng(seed).random(states.shape) < 0.01
+            answer = md_answer(ensemble(forms, states), 300.0, factors=[*np.where(asked, np.exp(lower), np.nan)])
+            found.append([[s.share for s in answer.states], [s.error for s in answer.states]])
+        return np.array(found)
+
+    off, stated = np.swapaxes(answers(6) - [right, np.zeros(3)], 0, 1)
+    monkeypatch.setattr(
+        told, "_reweighted_shares", lambda found, micro, labels, f, every: found.shares(micro, labels, 3, f)
+    )
+    plain, plain_stated = np.swapaxes(answers(6) - [right, np.zeros(3)], 0, 1)
+    assert np.sqrt(np.square(off).mean()) < 0.6 * np.sqrt(np.square(plain).mean())
+    assert stated.mean() < 0.6 * plain_stated.mean(), "negative control: weights of asked frames alone"
+    assert 0.5 < np.sqrt(np.square(off).mean()) / stated.mean() < 1.7
+
+
 def test_weights_make_plain_histograms_right(forms: np.ndarray) -> None:
     states = jumps(MATRIX, [2] * 32, 250, 7)
     answer = md_answer(ensemble(forms, states), 300.0)
