@@ -164,8 +164,9 @@ _VINYL_NM, _RING_NM = 0.136, 0.1385
 def has_stiff_bond(scene: Scene) -> bool:
     """Return whether MD with heavy hydrogens cannot take steps of 4 fs: for a bond that is triple or one of two double
     bonds of an atom (2,000 to 2,300 per cm), or for a double bond of a carbon that gave mass to its hydrogens: of
-    aldehydes, imines, =CH2 and CH=CH, in rings of furan's and thiazole's kind, too, but not in benzene's. Orders,
-    lengths and numbers of bonds tell."""
+    aldehydes, imines, =CH2 and CH=CH, in rings of furan's and thiazole's kind, too, but not in benzene's; and for the
+    carbonyl of a ring of four, and imides and anhydrides in rings of five. Near 1,850 per cm four steps are a period,
+    which is a resonance. Orders, lengths and numbers of bonds tell."""
     degree, order = (
         np.bincount(scene.bonds.ravel(), weights=weights, minlength=scene.n_atoms)
         for weights in (None, np.repeat(scene.bond_orders, 2))
@@ -187,7 +188,22 @@ def has_stiff_bond(scene: Scene) -> bool:
     both = (element[i] == "C") & (element[j] == "C") & (n_hydrogens[i] > 0) & (n_hydrogens[j] > 0)
     near_others = (with_o[i] > 0) | ((with_other[i] > 0) & (with_other[j] > 0))
     both &= (degree[i] == 3) & (degree[j] == 3) & (length < np.where(near_others, _RING_NM, _VINYL_NM))
-    return bool((triple | double | both).any())
+    return bool((triple | double | both).any()) or _has_strained_carbonyl(scene)
+
+
+def _has_strained_carbonyl(scene: Scene) -> bool:
+    """Return whether a carbonyl is in a ring of four or less, or two are on one atom in a ring of five."""
+    i, j = np.concatenate([scene.bonds, scene.bonds[:, ::-1]]).T
+    element, degree = np.array(scene.elements), np.array([len(near) for near in scene.neighbours()])
+    carbonyls = set(i[(element[i] == "C") & (degree[i] == 3) & (element[j] == "O") & (degree[j] == 1)].tolist())
+    on: dict[int, int] = {}
+    for (a, b), size in ring_sizes(bonded_graph(scene)).items() if carbonyls else ():
+        if size <= 4 and {a, b} & carbonyls:
+            return True
+        for carbon, other in ((a, b), (b, a)):
+            if size == 5 and carbon in carbonyls and element[other] in ("N", "O"):
+                on[other] = on.get(other, 0) + 1
+    return max(on.values(), default=0) > 1
 
 
 def ring_sizes(graph: nx.Graph) -> dict[tuple[int, int], int]:

@@ -16,8 +16,34 @@ from systems.library.named_scenes import prepare
 QUANTUM = {"force_field": "gfn2-xtb"}
 
 
-STIFF = ["CC#N", "CC#CC", "CCN=C=O", "O=C=O", "CC=O", "C=NC", "CC=C", "CC=CC", "C1=CCCCC1", "c1ccoc1", "c1cscn1"]
-SOFT = ["CC(C)=O", "CN=O", "Cc1cnc[nH]1", "CC=C(C)C", "c1ccccc1", "c1cc[nH]c1", "c1ccsc1", "c1cnccn1", "OC=1C=CC=CC=1"]
+STIFF = [
+    "CC#N",
+    "CC#CC",
+    "CCN=C=O",
+    "O=C=O",
+    "CC=O",
+    "C=NC",
+    "CC=C",
+    "CC=CC",
+    "C1=CCCCC1",
+    "c1ccoc1",
+    "c1cscn1",
+    "O=C1CCN1",
+    "CN1C(=O)c2ccccc2C1=O",
+]
+SOFT = [
+    "CC(C)=O",
+    "CN=O",
+    "Cc1cnc[nH]1",
+    "CC=C(C)C",
+    "c1ccccc1",
+    "c1cc[nH]c1",
+    "c1ccsc1",
+    "O=C1CCCN1",
+    "O=C1CC(=O)NC(=O)N1",
+    "c1cnccn1",
+    "OC=1C=CC=CC=1",
+]
 
 
 @pytest.mark.parametrize("smiles", [*STIFF, *SOFT])
