@@ -243,7 +243,7 @@ class _Run:
         assert record.rates is not None
         there = stage.found(self.site, record) if name in (*MD_STAGES, "rollout") else None
         may_take_s = seconds_of_first(pending, self.clock.budget_s - self.clock.spent_s)
-        if name in MD_STAGES and there is None:  # without MD to compare with all else was in vain
+        if name in (*MD_STAGES, "energies") and there is None:  # without what to compare with all else was in vain
             may_take_s = max(may_take_s, LEAST_MD_S * max(1.0, 0.5 * record.rates.stretch))
         if name == "report":  # it is made however long it takes, for the same reason
             may_take_s = math.inf

@@ -30,11 +30,11 @@ _TOGETHER = 16
 
 
 def ask_reference(scene: Scene, weights: Weights, rolled: Ensemble, folder: Path, seconds: float, seed: int) -> None:
-    """Write U_reference - U_model, kJ/mol, of as many frames as `seconds` allow into `folder`: valid ones drawn at
-    random, none that is there already.
+    """Write U_reference - U_model, kJ/mol, of frames into `folder`: as many as `seconds` allow, and a few in any case,
+    valid ones drawn at random, none that is there already.
 
-    Frames that the reference has no energy for, or that are another molecule, get infinity. Raises InputError where
-    time is too short for any, PreparationError for what the reference refuses.
+    Frames that the reference has no energy for, or that are another molecule, get infinity. Raises InputError where it
+    has none of any, PreparationError for what it refuses.
     """
     until = time.monotonic() + seconds
     model = weights.model
@@ -51,20 +51,20 @@ def ask_reference(scene: Scene, weights: Weights, rolled: Ensemble, folder: Path
         with Labeller(scene) as reference:
             n = _TOGETHER * reference.n_workers
             for first in range(0, len(order), n):
-                stop_if_asked()
-                if time.monotonic() > until:
-                    break
                 batch = [frames[i] for i in order[first : first + n]]
                 x = np.array([rolled.segments[k][t] for k, t in batch], dtype=np.float64)
                 with torch.no_grad():
                     own = model.energies(torch.from_numpy(x[:, match.order]), molecule).mean(-1).numpy()
                 for (k, t), difference in zip(batch, reference.energies(x) - own, strict=True):
                     found[k][t] = difference
+                stop_if_asked()
+                if time.monotonic() > until:
+                    break
     finally:  # what was asked is kept, also where its time was up
         if any(np.isfinite(f).any() for f in found):
             _write(folder, found)
     if not any(np.isfinite(f).any() for f in found):
-        raise InputError("GFN2-xTB has no energy of any frame of the rollout in its time.")
+        raise InputError("GFN2-xTB has no energy of any frame of the rollout.")
 
 
 def _write(folder: Path, found: list[FloatArray]) -> None:

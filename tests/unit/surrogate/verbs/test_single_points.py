@@ -9,6 +9,7 @@ import pytest
 import torch
 
 from md_reference.forces.quantum import Potential
+from md_reference.run.machine import available_cores
 from surrogate.comparison.read.ensemble import Ensemble
 from surrogate.models.architecture import shipped_weights
 from surrogate.models.painet.energy import PainetPotential
@@ -77,8 +78,18 @@ def test_what_was_asked_before_the_time_was_up_is_kept(
         ask_reference(scene, general, rolled(scene, 40), tmp_path, 600.0, 0)
     found = np.concatenate(differences(tmp_path, [40, 40]))
     assert 0 < np.isfinite(found).sum() < 79
+    monkeypatch.setattr(single_points.Labeller, "energies", lambda self, x: np.full(len(x), np.inf))
     with pytest.raises(InputError, match="no energy of any frame"):
-        ask_reference(scene, general, rolled(scene), tmp_path / "none", -1.0, 0)
+        ask_reference(scene, general, rolled(scene), tmp_path / "none", 60.0, 0)
+    assert not (tmp_path / "none").exists()
+
+
+def test_where_there_is_no_time_a_few_frames_are_asked_for_all_the_same(
+    tmp_path: Path, scene: Scene, general: Weights, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(single_points, "_TOGETHER", 1)
+    ask_reference(scene, general, rolled(scene, 40), tmp_path, -1.0, 0)
+    assert 0 < np.isfinite(np.concatenate(differences(tmp_path, [40, 40]))).sum() <= available_cores()
 
 
 def test_a_frame_of_another_molecule_weighs_nothing() -> None:
