@@ -19,6 +19,7 @@ from surrogate.sampling.domain import match_known
 from surrogate.verbs.run.run_record import ENERGIES_NAME
 from systems.chemistry.validity import INVALID
 from systems.errors import InputError
+from systems.files.outside import content
 from systems.files.whole_file import create_whole
 from systems.interrupts import stop_if_asked
 from systems.scene import Scene
@@ -73,13 +74,17 @@ def _write(folder: Path, found: list[FloatArray]) -> None:
 
 
 def differences(folder: Path, lengths: list[int]) -> list[FloatArray]:
-    """Return the differences in a folder, an array of `lengths` a replica, NaN for frames that were not asked for."""
-    found = [np.full(n, np.nan) for n in lengths]
-    if (folder / ENERGIES_NAME).is_file():
-        rows = np.loadtxt(folder / ENERGIES_NAME, delimiter=",", skiprows=1, ndmin=2)
-        for k, values in enumerate(found):
-            own = rows[(rows[:, 0] == k) & (rows[:, 1] < len(values))]
-            values[own[:, 1].astype(int)] = own[:, 2]
+    """Return the differences in a folder, an array of `lengths` a replica, NaN for frames that were not asked for.
+    Raises InputError for a damaged file."""
+    found, path = [np.full(n, np.nan) for n in lengths], folder / ENERGIES_NAME
+    try:
+        lines = content(path).decode().splitlines()[1:] if path.is_file() else []
+        for replica, frame, difference in (line.split(",") for line in lines):
+            k, t = int(replica), int(frame)
+            if 0 <= k < len(found) and 0 <= t < len(found[k]):
+                found[k][t] = float(difference)
+    except (OSError, ValueError) as error:
+        raise InputError(f"{path} cannot be read ({error}); remove it, and `resume=True` asks anew.") from error
     return found
 
 

@@ -92,6 +92,16 @@ def test_where_there_is_no_time_a_few_frames_are_asked_for_all_the_same(
     assert 0 < np.isfinite(np.concatenate(differences(tmp_path, [40, 40]))).sum() <= available_cores()
 
 
+def test_a_damaged_file_is_refused_in_a_line(tmp_path: Path) -> None:
+    for text in ("replica,frame,difference_kj_mol\n0,1\n", "a\n0,x,1.0\n", "a\n0,1,1.0,2\n"):
+        (tmp_path / ENERGIES_NAME).write_text(text)
+        with pytest.raises(InputError, match=r"energies\.csv cannot be read"):
+            differences(tmp_path, [4])
+    (tmp_path / ENERGIES_NAME).write_text("a\n0,1,2.5\n-1,1,9.0\n0,7,9.0\n5,0,9.0\n")
+    (found,) = differences(tmp_path, [4])
+    assert found[1] == 2.5 and np.isnan(found[[0, 2, 3]]).all(), "frames that are not there are left out"
+
+
 def test_a_frame_of_another_molecule_weighs_nothing() -> None:
     factors = factors_of([np.array([1.0, np.inf, np.nan]), np.array([3.494, np.nan, np.nan])], 300.0)
     assert factors[0][:2].tolist() == [1.0, 0.0] and np.isnan(factors[0][2])
