@@ -50,7 +50,6 @@ _TURN_EVERY = 3
 # Bonds of hot states are stretched, which a potential must learn; those longer than this, in radii, are broken.
 _BROKEN = 1.6
 _worker: Potential | None = None
-BoolArray = npt.NDArray[np.bool_]
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,7 +109,7 @@ class Labeller(Closing):
         found[same] = [np.inf if answer is None else answer[0] for answer in self._answers(asked[same])]
         return found
 
-    def _is_same(self, states: FloatArray) -> BoolArray:
+    def _is_same(self, states: FloatArray) -> npt.NDArray[np.bool_]:
         """Return which states are no other molecule."""
         turned = changed_stereo(self.scene, states)
         return np.array([not t and not changed_bond(self.scene, x, stretch=_BROKEN)

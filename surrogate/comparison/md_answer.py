@@ -81,10 +81,9 @@ class StateEnergy:
 class Answer:
     """What MD says of a molecule, or a learned potential's rollout that its reference's energies reweight: `energies`
     says of how many frames, and how many are effective. `weights`: of every frame, an array a replica; `lag_ps` between
-    frames;
-    `timescales_ps` with `timescale_errors_ps`, descending; `states`; `maps`: for each residue the free energy in kJ/mol
-    `(36, 36)` over φ and ψ, from -180°, infinity where MD never was; `has_images`: whether each replica counts with its
-    mirror image; `missing`: what it cannot tell."""
+    frames; `timescales_ps` with `timescale_errors_ps`, descending; `states`; `maps`: for each residue the free energy
+    in kJ/mol `(36, 36)` over φ and ψ, from -180°, infinity where MD never was; `has_images`: whether each replica
+    counts with its mirror image; `missing`: what it cannot tell."""
 
     method: str
     n_replicas: int

@@ -23,7 +23,7 @@ from systems.files.outside import content
 from systems.files.whole_file import create_whole
 from systems.interrupts import stop_if_asked
 from systems.scene import Scene
-from systems.units import GAS_CONSTANT_KJ_MOL_K
+from systems.trajectory.codec import reweighting
 
 _COLUMNS = "replica,frame,difference_kj_mol"
 # Frames that a core computes before the clock is looked at again.
@@ -89,6 +89,8 @@ def differences(folder: Path, lengths: list[int]) -> list[FloatArray]:
 
 
 def factors_of(differences_kj_mol: list[FloatArray], temperature_k: float) -> list[FloatArray]:
-    """Return what each frame counts, exp(-difference / kT), the greatest 1; NaN stays, and infinity counts nothing."""
-    least = min(float(np.nanmin(d)) for d in differences_kj_mol if np.isfinite(d).any())
-    return [np.exp((least - d) / (GAS_CONSTANT_KJ_MOL_K * temperature_k)) for d in differences_kj_mol]
+    """Return what each frame counts at the reference's law (`reweighting`); NaN stays, and infinity counts nothing."""
+    every = np.concatenate(differences_kj_mol)
+    factors, asked = np.full(len(every), np.nan), ~np.isnan(every)
+    factors[asked] = reweighting(every[asked], temperature_k)[0]
+    return np.split(factors, np.cumsum([len(d) for d in differences_kj_mol])[:-1])

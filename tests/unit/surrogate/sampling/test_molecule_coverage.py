@@ -16,6 +16,7 @@ from surrogate.sampling.domain import choose_weights, match_domain
 from surrogate.sampling.simulation import LearnedForces
 from systems.errors import InputError, OutOfDomainError
 from systems.library.named_scenes import prepare
+from systems.scene import Scene
 from systems.trajectory.codec import open_trajectory
 
 TRUSTED = Chemistry(("C", "H", "N", "O"), 24, (-1, 0), 1e4)
@@ -76,6 +77,25 @@ def test_where_members_disagree_it_is_refused_with_the_spread(tmp_path: Path, al
     assert info(strict.path, "smiles:CNC(C)=O")["covered"] == "only with force"
     # The molecule that it was trained on is never asked.
     assert match_domain(prepare("alanine-dipeptide"), strict).seen
+
+
+def test_a_molecule_is_asked_once_and_again_where_it_or_the_limit_is_another(
+    tmp_path: Path, alanine: Weights, general: Weights, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    calls: list[str] = []
+
+    def agreeing(scene: Scene, model: object) -> tuple[float, int]:
+        calls.append(scene.name)
+        return 0.0, 0
+
+    monkeypatch.setattr(coverage, "disagreement", agreeing)
+    monkeypatch.setattr(coverage, "_doubts_of", {})
+    scene = prepare("smiles:CNC(C)=O")
+    strict = saved(tmp_path / "strict.safetensors", alanine, replace(TRUSTED, spread_kj_mol_nm=1.0))
+    for weights in (general, general, strict):
+        match_domain(scene, weights)
+    match_domain(replace(scene, positions_nm=scene.positions_nm[:, ::-1].copy()), strict)
+    assert len(calls) == 3
 
 
 def test_a_molecule_that_flies_apart_is_refused(general: Weights) -> None:
