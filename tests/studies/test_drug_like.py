@@ -61,7 +61,7 @@ def test_training_on_a_batch_brings_the_forces_nearer(model: PainetPotential) ->
     learner = Learner(model, learned, learned, 4, 4, torch.device("cpu"))
     optimiser, generator = torch.optim.Adam(model.parameters(), 3e-3), torch.Generator().manual_seed(0)
     before = learner.errors()["validation_force_kcal"]
-    for _ in range(60):
+    for _ in range(120):
         optimiser.zero_grad()
         learner.loss(generator)[0].backward(inputs=[*model.parameters()])
         optimiser.step()

@@ -2,12 +2,14 @@
 
     python docs/studies/training/alanine_dipeptide.py FOLDER
     python docs/studies/training/alanine_dipeptide.py FOLDER --only train --budget 90min
+    python docs/studies/training/alanine_dipeptide.py FOLDER --only train --form joined --budget 5min --device cuda
 
 Steps, each skipped where its files are there and resumed where it was stopped:
 
 - `reference`: ff14SB, OBC2, 300 K, 1/ps, 4 fs, SIMD replicas of 30 ns, frames 10 ps apart: 32 to train on (two of them
   are held out whole, for the validation curve) and 32 that training never sees, the test and its replicate.
-- `train`: both stages, at most `--budget` of wall time; `model.csv` beside the weights has the curves.
+- `train`: both stages, at most `--budget` of wall time; `model.csv` beside the weights has the curves. `--form joined`:
+  all latents of a frame in one token; `random`: identifiers drawn anew for each sample of stage one.
 - `ship`: weights as float16, `alanine-dipeptide.safetensors`.
 - `compare`: 16 rollouts of 30 ns against sixteen test replicas, the other sixteen as the replicate baseline.
 
@@ -24,6 +26,7 @@ preconditioned (Karras 2022) with logit-normal flow times, and every other windo
 from __future__ import annotations
 
 import argparse
+from dataclasses import replace
 from pathlib import Path
 
 from processes import is_trained
@@ -48,6 +51,11 @@ MODEL = LamSlideConfig(
     autoencoder=AutoencoderConfig(n_latents=4, latent_dim=24, identifier_pool=32, random_identifiers=0.0),
     approximator=ApproximatorConfig(chunk_frames=8, latents_per_token=1, width=128, n_layers=4, auxiliary_frames=2),
 )
+FORMS = {
+    "model": MODEL,
+    "joined": replace(MODEL, approximator=replace(MODEL.approximator, latents_per_token=4)),
+    "random": replace(MODEL, autoencoder=replace(MODEL.autoencoder, random_identifiers=1.0)),
+}
 
 
 def replicas(folder: Path, kind: str) -> list[Path]:
@@ -65,16 +73,17 @@ def training_frames(folder: Path) -> TrainingFrames:
     """Return the frames of the training replicas, every twelfth of which is for validation."""
     paths = replicas(folder, "train")
     held = [path for k, path in enumerate(paths) if k % 16 == 15]
-    return collect_frames([path for path in paths if path not in held], held=held)
+    return collect_frames([path for path in paths if path not in held and path.exists()],
+                          held=[path for path in held if path.exists()])  # fmt: skip
 
 
-def train(folder: Path, budget_s: float) -> Path:
-    """Train both stages, a fifth of the budget for the first, and write `model.safetensors`."""
-    out = folder / "model.safetensors"
+def train(folder: Path, form: str, budget_s: float, device: str) -> Path:
+    """Train both stages, a fifth of the budget for the first, and write `FORM.safetensors`."""
+    out = folder / f"{form}.safetensors"
     if not is_trained(out):
-        config = TrainingConfig(budget_s=budget_s, time_reversal=True)
+        config = TrainingConfig(budget_s=budget_s, time_reversal=True, device=device)
         with progress_bar("alanine dipeptide", quiet=False) as advance:
-            train_lam_slide(training_frames(folder), out, MODEL, config, resume=True,
+            train_lam_slide(training_frames(folder), out, FORMS[form], config, resume=True,
                             progress=lambda stage, share, _: advance(round(1000 * share), 1000, stage))  # fmt: skip
     return out
 
@@ -85,12 +94,12 @@ def ship(weights: Path, out: Path) -> None:
     save_weights(out, whole.model, whole.domain, whole.provenance, half=True)
 
 
-def compare(folder: Path, weights: Path) -> None:
+def compare(folder: Path, weights: Path, ending: str) -> None:
     """Roll as many replicas as the test has, as long, and compare; `comparison.html` and what the command prints."""
-    outs = api.rollout(SCENE, weights, folder / "rollout.h5", time_ps=REPLICA_PS, replicas=ROLLOUTS, seed=ROLLOUT_SEED,
-                       resume=True)  # fmt: skip
+    outs = api.rollout(SCENE, weights, folder / f"rollout{ending}.h5", time_ps=REPLICA_PS, replicas=ROLLOUTS,
+                       seed=ROLLOUT_SEED, resume=True)  # fmt: skip
     held = replicas(folder, "held")
-    api.compare(held[:ROLLOUTS], [outs], folder / "comparison.html", replicate=held[ROLLOUTS:], overwrite=True)
+    api.compare(held[:ROLLOUTS], [outs], folder / f"comparison{ending}.html", replicate=held[ROLLOUTS:], overwrite=True)
 
 
 def main() -> None:
@@ -98,18 +107,22 @@ def main() -> None:
     parser.add_argument("folder", type=Path, metavar="FOLDER")
     parser.add_argument("--only", choices=STEPS, help="this step alone")
     parser.add_argument("--budget", default="95min", help="wall time of the training (default 95min)")
+    parser.add_argument("--form", choices=FORMS, default="model", help="other ones are not shipped")
+    parser.add_argument("--device", default="cpu", help="of the training")
     args = parser.parse_args()
     args.folder.mkdir(parents=True, exist_ok=True)
     shipped = args.folder / f"{SCENE}.safetensors"
-    for step in STEPS if args.only is None else (args.only,):
+    plain = args.form == "model"
+    for step in [s for s in STEPS if plain or s != "ship"] if args.only is None else [args.only]:
         if step == "reference":
             make_reference(args.folder)
         elif step == "train":
-            train(args.folder, parse_wall_s(args.budget))
+            train(args.folder, args.form, parse_wall_s(args.budget), args.device)
         elif step == "ship":
             ship(args.folder / "model.safetensors", shipped)
         else:
-            compare(args.folder, shipped)
+            weights, ending = (shipped, "") if plain else (args.folder / f"{args.form}.safetensors", f"_{args.form}")
+            compare(args.folder, weights, ending)
 
 
 if __name__ == "__main__":

@@ -26,7 +26,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from drug_like_states import Entry, read_compact, read_list
+from drug_like_states import COMPACT, HIGHEST_KJ_MOL, RECOMBINED, Entry, file_of, read_compact, read_list
 from recorded import Recorded
 from torch import Tensor
 from torch.nn import functional as F
@@ -58,9 +58,8 @@ from systems.scene import ATOMIC_NUMBERS
 from systems.trajectory.codec import open_trajectory
 from systems.units import parse_time_ps, parse_wall_s
 
-# States so far above a molecule's lowest, for each atom, are left out: no MD comes there.
-HIGHEST_KJ_MOL = 12.0
 BAG, SEED = 0.75, 7
+ENERGY_WEIGHT = 2.0
 SUMS = ("n_scalars", "n_vectors", "n_tensors")
 KJ_MOL_NM_PER_KCAL_MOL_A, KJ_MOL_PER_KCAL = 41.84, 4.184
 # Molecules are batched with others of about their size, in so many arrays of one shape.
@@ -85,18 +84,22 @@ def load(folder: Path, splits: Sequence[str], most: int | None = None, states: i
     """Return the molecules of these splits that have been labelled, at most so many, with at most so many states."""
     found = []
     for number, entry in enumerate(read_list()):
-        path = folder / f"{number:04d}.npz"
-        split = ASIDE if entry.split == "train" and number % ASIDE_EVERY == 0 else entry.split
-        if split not in splits or not path.exists():
+        aside = entry.split == "train" and entry.source != RECOMBINED and number % ASIDE_EVERY == 0
+        split = ASIDE if aside else entry.split
+        paths = [path for by in (None, "any") if (path := file_of(folder, number, by)).exists()]
+        if split not in splits or not paths:
             continue
-        with np.load(path) as data:
-            energies = data["energies_kj_mol"] - data["energies_kj_mol"].min()
-            numbers = torch.from_numpy(data["numbers"])
-            kept = energies < HIGHEST_KJ_MOL * len(numbers)
-            molecule = Molecule(numbers, torch.ones(len(numbers)), torch.from_numpy(data["bonds"]),
-                                charge=int(data["charges"].sum()))  # fmt: skip
-            x, forces = (read_compact(data, name)[kept] for name in ("positions_nm", "forces_kj_mol_nm"))
-            arrays = (a[:states] for a in (x, energies[kept].astype(np.float32), forces))
+        found_in = []
+        for path in paths:
+            with np.load(path) as data:
+                found_in.append((data["energies_kj_mol"], *(read_compact(data, name) for name in COMPACT)))
+                numbers = torch.from_numpy(data["numbers"])
+                molecule = Molecule(numbers, torch.ones(len(numbers)), torch.from_numpy(data["bonds"]),
+                                    charge=int(data["charges"].sum()))  # fmt: skip
+        energies, x, forces = map(np.concatenate, zip(*found_in, strict=True))
+        energies = energies - energies.min()
+        kept = energies < HIGHEST_KJ_MOL * len(numbers)
+        arrays = (a[kept][:states] for a in (x, energies.astype(np.float32), forces))
         if kept.sum() >= 8:
             found.append(Labelled(entry, Topology.of(molecule), *map(torch.from_numpy, arrays)))
         if most and len(found) >= most:
@@ -231,13 +234,10 @@ class Learner:
         draw = torch.rand(len(learned), model.config.n_members, generator=torch.Generator().manual_seed(SEED))
         bags = ((draw < BAG) | (draw == draw.amin(1, keepdim=True))).float()
         self.buckets, self.held = buckets_of(learned, bags, device), buckets_of(held, torch.ones(len(held), 1), device)
-        forces = torch.cat([s.forces.square().mean((1, 2)) for s in learned])
-        self.scale = 0.1 * float(forces.median().sqrt())
-        model.energy_scale_kj_mol.fill_(self.scale)
-        model.energy_offset_kj_mol.zero_()
+        self.scale = float(model.energy_scale_kj_mol)
 
     def loss(self, generator: torch.Generator) -> tuple[Tensor, dict[str, Tensor]]:
-        """Mean length of the error of an atom's force, and mean square error of energies for each atom."""
+        """Mean length of the error of an atom's force, and mean error of energies over the root of the atoms."""
         place = int(torch.randint(len(self.buckets), (), generator=generator))
         bucket = self.buckets[place]
         u = torch.rand(self.molecules, self.rows + 2, generator=generator).to(bucket.charge)
@@ -265,8 +265,8 @@ class Learner:
         real = (bucket.elements[chosen] > 0)[:, None]
         of_forces = ((wrong.square().sum(-1) + 1e-8).sqrt() * real).sum() / real.sum() / self.rows
         off = (found - bucket.energies[chosen[:, None], picked]) / self.scale
-        of_energies = ((off - off.mean(1, keepdim=True)).square().mean(1) / real.sum((1, 2)) ** 0.5).mean()
-        return torch.stack([of_forces, 0.1 * of_energies])
+        uneven = ((off - off.mean(1, keepdim=True)).square() + 1e-8).sqrt().mean(1)
+        return torch.stack([of_forces, ENERGY_WEIGHT * (uneven / real.sum((1, 2)) ** 0.5).mean()])
 
     def errors(self) -> dict[str, float]:
         found = torch.cat([errors_of_many(self.model, bucket) for bucket in self.held])
@@ -327,17 +327,27 @@ def train(given: argparse.Namespace) -> None:
     torch.manual_seed(SEED)
     sums = dict(zip(SUMS, given.sums, strict=True))
     config = PotentialConfig(width=given.width, n_steps=given.steps_of_network, **sums)
-    model = PainetPotential(config)
+    model, domain = PainetPotential(config), None
+    if given.start:
+        weights = load_weights(given.start)
+        assert isinstance(weights.model, PainetPotential)
+        config, domain = weights.model.config, weights.domain
+        model = PainetPotential(config)
+        model.load_state_dict(weights.model.state_dict())
     learned, held = load(given.folder, ["train"], given.most, given.states), load(given.folder, ["test"])
     said(f"{len(learned)} molecules with {sum(len(s.energies) for s in learned):,} states, {len(held)} held out; "
          f"{sum(p.numel() for p in model.parameters()):,} parameters")  # fmt: skip
     set_walls(model, learned)
+    if domain is None:
+        forces = torch.cat([s.forces.square().mean((1, 2)) for s in learned])
+        model.energy_scale_kj_mol.fill_(0.1 * float(forces.median().sqrt()))
+        model.energy_offset_kj_mol.zero_()
+        domain = load_weights(given.like).domain if given.like else domain_of(learned, config)
     device = torch.device(choose_device(given.device))
     torch.set_float32_matmul_precision("high")
     learner = Learner(model.to(device), learned, held, given.molecules, given.rows, device)
-    domain = load_weights(given.like).domain if given.like else domain_of(learned, config)
-    stage = StageConfig("potential", given.molecules * given.rows, 2e-3, given.budget, matrix_rate=0.01, seed=SEED,
-                        bf16=False, validate_every_s=given.validate)  # fmt: skip
+    stage = StageConfig("potential", given.molecules * given.rows, given.rate, given.budget, given.steps, seed=SEED,
+                        bf16=False, matrix_rate=5.0 * given.rate, validate_every_s=given.validate)  # fmt: skip
 
     def write(spent_s: list[float]) -> None:
         sources = [{"file": "docs/studies/training/drug_like.tsv", "n_frames": sum(len(s.energies) for s in learned)}]
@@ -488,8 +498,11 @@ def main() -> None:
     training.add_argument("--sums", type=int, nargs=3, default=[16, 8, 4], help="scalars, vectors, tensors of a look")
     training.add_argument("--device", default="auto")
     training.add_argument("--like", type=Path, help="weights whose domain these get, where RDKit and OpenMM are not")
+    training.add_argument("--start", type=Path, help="weights to begin from, with their domain")
+    training.add_argument("--rate", type=float, default=2e-3)
     training.add_argument("-o", "--out", type=Path, required=True)
-    training.add_argument("--budget", type=lambda text: parse_wall_s(text, "--budget"), required=True)
+    training.add_argument("--budget", type=lambda text: parse_wall_s(text, "--budget"))
+    training.add_argument("--steps", type=int)
     training.add_argument("--resume", action="store_true")
     training.add_argument("--molecules", type=int, default=4)
     training.add_argument("--rows", type=int, default=24)
