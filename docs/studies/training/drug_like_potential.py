@@ -2,6 +2,7 @@
 
     python docs/studies/training/drug_like_potential.py train FOLDER -o OUT.safetensors --budget 6h [--resume]
     python docs/studies/training/drug_like_potential.py errors OUT.safetensors FOLDER
+    python docs/studies/training/drug_like_potential.py effective OUT.safetensors [--molecules 18]
     python docs/studies/training/drug_like_potential.py trust OUT.safetensors FOLDER [--time 250ps]
     python docs/studies/training/drug_like_potential.py stability OUT.safetensors FOLDER [--time 250ps] [--molecules 50]
     python docs/studies/training/drug_like_potential.py tune OUT.safetensors FOLDER [--seconds 60 180] [--molecules 10]
@@ -9,7 +10,9 @@
 FOLDER is what drug_like_states.py labels. A step takes some molecules and some states of each. Energies count less
 their mean over a molecule's states, so that no baseline of atoms is needed; each member of the potential learns from
 three molecules in four, so that members disagree about chemistry that they have not seen. `errors` prints errors on
-the molecules that are held out, beside those that are trained on. `trust` rolls molecules that are neither, measures
+the molecules that are held out, beside those that are trained on. `effective` prints how much the energy is off in MD
+on the weights, at 300 K, of held-out molecules, and how many of such frames count once they are weighted to
+GFN2-xTB's law. `trust` rolls molecules that are neither, measures
 where the members' spread (`sampling.domain`) tells those that fly apart, and writes that limit into the weights.
 `stability` rolls held-out molecules that the weights then do not refuse. `tune` trains on held-out molecules one by
 one, beginning with the weights and with nothing, as `surromd train` does.
@@ -26,12 +29,24 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from drug_like_states import COMPACT, HIGHEST_KJ_MOL, RECOMBINED, Entry, file_of, read_compact, read_list
+from drug_like_states import (
+    COMPACT,
+    HIGHEST_KJ_MOL,
+    RECOMBINED,
+    ROLLED_REPLICAS,
+    Entry,
+    conformers,
+    file_of,
+    read_compact,
+    read_list,
+    rolled_states,
+)
 from recorded import Recorded
 from torch import Tensor
 from torch.nn import functional as F
 
 import surrogate as sm
+from md_reference.forces.quantum import Potential
 from surrogate.models.painet.energy import (
     LEAST_NM,
     N_SHELLS,
@@ -55,7 +70,7 @@ from systems.chemistry.validity import INVALID, geometry_from_scene
 from systems.errors import SimulationError, SurromdError
 from systems.library.named_scenes import prepare
 from systems.scene import ATOMIC_NUMBERS
-from systems.trajectory.codec import open_trajectory
+from systems.trajectory.codec import open_trajectory, reweighting
 from systems.units import parse_time_ps, parse_wall_s
 
 BAG, SEED = 0.75, 7
@@ -388,6 +403,26 @@ def print_errors(given: argparse.Namespace) -> None:
              f"{np.median(spread):.3f}, whose correlation with the error is {related:.2f}")  # fmt: skip
 
 
+def print_effective(given: argparse.Namespace) -> None:
+    model = load_weights(given.weights).model
+    assert isinstance(model, PainetPotential)
+    rows = []
+    entries = read_list()
+    named, unseen = ([e for e in entries if e.split == split] for split in ("named", "test"))
+    for entry in (named + unseen)[: given.molecules]:
+        scene = prepare(f"smiles:{entry.smiles}")
+        reference = Potential(scene)
+        starts = np.stack(conformers(scene, entry.smiles, SEED))
+        x = rolled_states(scene, given.weights, starts, SEED)[ROLLED_REPLICAS:]  # at 300 K
+        own = model.energies(torch.from_numpy(x), Molecule.of(scene)).mean(-1).detach().numpy()
+        off = np.array([reference(state)[0] for state in x]) - own
+        share = reweighting(off, 300.0)[1] / len(off)
+        rows.append((off.std(), share))
+        said(f"{entry.smiles}: off by {off.std():.1f} kJ/mol, {100 * share:.0f} % effective")
+    off_by, shares = np.median(rows, axis=0)
+    said(f"{len(rows)} molecules: off by {off_by:.1f} kJ/mol, {100 * shares:.0f} % effective (medians)")
+
+
 def stays_whole(weights: Weights, smiles: str, time_ps: float, out: Path) -> float:
     """Return the share of replicas whose frames are all valid after so long."""
     try:
@@ -482,15 +517,16 @@ def said(line: str) -> None:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     verbs = parser.add_subparsers(dest="verb", required=True)
-    names = ("train", "errors", "trust", "stability", "tune")
-    training, errors, trusting, staying, tuning = (verbs.add_parser(name) for name in names)
-    for part in (errors, trusting, staying, tuning):
+    names = ("train", "errors", "effective", "trust", "stability", "tune")
+    training, errors, counting, trusting, staying, tuning = (verbs.add_parser(name) for name in names)
+    for part in (errors, counting, trusting, staying, tuning):
         part.add_argument("weights", type=Path)
     for part in (training, errors, trusting, staying, tuning):
         part.add_argument("folder", type=Path)
     tuning.add_argument("--seconds", type=float, nargs="+", default=[60.0, 180.0])
     tuning.add_argument("--molecules", type=int, default=10)
     staying.add_argument("--molecules", type=int, default=50)
+    counting.add_argument("--molecules", type=int, default=18)
     for part in (trusting, staying):
         part.add_argument("--time", type=lambda text: parse_time_ps(text, "--time"), default=250.0)
     training.add_argument("--width", type=int, default=96)
@@ -511,7 +547,15 @@ def main() -> None:
     training.add_argument("--threads", type=int, default=1)
     training.add_argument("--validate", type=float, default=300.0)
     given = parser.parse_args()
-    {"train": train, "errors": print_errors, "trust": trust, "stability": stability, "tune": tune}[given.verb](given)
+    verb = {
+        "train": train,
+        "errors": print_errors,
+        "effective": print_effective,
+        "trust": trust,
+        "stability": stability,
+        "tune": tune,
+    }
+    verb[given.verb](given)
 
 
 if __name__ == "__main__":
