@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 from drug_like_potential import Bucket, Labelled, Learner, energies_of_many, load, set_walls
-from drug_like_states import Entry, make_compact, read_list
+from drug_like_states import RECOMBINED, Entry, file_of, make_compact, read_list
 from recorded import Recorded
 from torch import nn
 
@@ -106,3 +106,27 @@ def test_a_recorded_loss_has_the_gradients_of_one_that_is_not() -> None:
         expected.backward()
         assert torch.allclose(found, expected)
         assert torch.allclose(kept, layer.weight.grad)
+
+
+def test_states_of_a_potentials_own_md_are_loaded_with_the_others(tmp_path) -> None:
+    number, entry = next((k, e) for k, e in enumerate(read_list()) if e.source == RECOMBINED and k % 42 == 0)
+    energies = {None: np.linspace(5.0, 6.0, 9), "by": np.array([2.0, *np.full(6, 3.0), 1e6])}
+    for by, of_states in energies.items():
+        n = len(of_states)
+        np.savez(file_of(tmp_path, number, by), positions_nm=np.zeros((n, entry.n_atoms, 3), np.float32),
+                 forces_kj_mol_nm=np.zeros((n, entry.n_atoms, 3), np.float32), energies_kj_mol=of_states,
+                 bonds=np.array([(0, k) for k in range(1, entry.n_atoms)]), numbers=np.full(entry.n_atoms, 6),
+                 charges=np.zeros(entry.n_atoms))  # fmt: skip
+    (one,) = load(tmp_path, ["train"])
+    # Energies share a zero; the state that nothing comes to is left out.
+    assert one.energies.tolist() == pytest.approx([*np.linspace(3.0, 4.0, 9), 0.0, *[1.0] * 6])
+
+
+def test_no_recombined_molecule_has_the_scaffold_of_one_that_is_held_out() -> None:
+    from rdkit.Chem.Scaffolds.MurckoScaffold import MurckoScaffoldSmiles
+
+    entries = read_list()
+    made = {MurckoScaffoldSmiles(e.smiles) for e in entries if e.source == RECOMBINED}
+    held = {MurckoScaffoldSmiles(e.smiles) for e in entries if e.split != "train"} - {""}
+    assert len(made) > 100
+    assert not made & held

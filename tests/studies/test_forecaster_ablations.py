@@ -58,7 +58,7 @@ def test_local_attention_is_of_neighbours_alone(structure: Structure) -> None:
     assert not gradient[0, 3:].any()
 
 
-def test_seeds_train_side_by_side_as_each_alone(tmp_path: Path) -> None:
+def test_seeds_differ_and_each_of_them_learns(tmp_path: Path) -> None:
     rng = np.random.default_rng(0)
     start = rng.normal(size=(48, 1, 4, 3))
     v = rng.normal(size=(48, 1, 4, 3))

@@ -344,17 +344,18 @@ def run_table(given: argparse.Namespace) -> None:
     for path in given.results:
         for row in json.loads(path.read_text()):
             by.setdefault((row["task"], row["molecule"], row["method"]), row)
+    methods = [method for method in METHODS if any(key[2] == method for key in by)]
     rows = []
     for task, name in dict.fromkeys(key[:2] for key in sorted(by, reverse=True)):
         of = {method: by[task, name, method] for method in METHODS if (task, name, method) in by}
-        cells = [percent(of[m]["error"]) + ("" if of[m]["ended"] else " *") if m in of else "" for m in METHODS]
+        cells = [percent(of[m]["error"]) + ("" if of[m]["ended"] else " *") if m in of else "" for m in methods]
         rows.append([task, name, f"{100.0 * next(iter(of.values()))['frozen']:.3g}", *cells])
     table = {
         "command": "python docs/studies/published/forecaster_ablations.py table RESULTS.json...",
         "machine": given.machine,
         "note": "Mean square error on test windows, 1e-2 Å^2 per coordinate, mean ± standard deviation over seeds. "
                 "*: the validation error still fell when time was up.",
-        "columns": ["task", "molecule", "frozen", *METHODS],
+        "columns": ["task", "molecule", "frozen", *methods],
         "rows": rows,
     }  # fmt: skip
     given.out.write_text(json.dumps(table, indent=1, ensure_ascii=False) + "\n")
