@@ -46,7 +46,7 @@ MOLECULES = {
 }
 SEEDS = (0, 1)
 # Two runs so many of their errors apart have errors that are too small: such a molecule counts as no speed-up.
-CONTRADICTED = 3.0
+LARGEST_Z = 3.0
 
 
 def make_runs(folder: Path, names: list[str], minutes: float) -> None:
@@ -112,7 +112,7 @@ def line(name: str, runs: list[Run]) -> tuple[list[str], float]:
     least = [np.min((r.worth_ps() / r.md_ps)[varies]) for r in runs]
     a, b = runs
     z = float(np.sqrt(np.mean(np.square((a.mean - b.mean)[varies]) / (a.error**2 + b.error**2)[varies])))
-    worth = worth if z < CONTRADICTED else [0.0, 0.0]
+    worth = worth if z < LARGEST_Z else [0.0, 0.0]
     shares = ", ".join(f"{r.effective / r.asked:.0%} of {r.asked}" for r in runs)
     rolled = float(np.mean([r["rolled_ps"] for r in (x.result["outcome"] for x in runs)])) * 2e-3
     return [
