@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from drug_like_potential import Bucket, Labelled, Learner, energies_of_many, load, set_walls
+from drug_like_potential import KJ_MOL_NM_PER_KCAL_MOL_A, Bucket, Labelled, Learner, energies_of_many, load, set_walls
 from drug_like_states import RECOMBINED, Entry, file_of, make_compact, read_list
 from recorded import Recorded
 from torch import nn
@@ -31,12 +31,16 @@ def taught_by(teacher: PainetPotential, one: Labelled) -> Labelled:
     """Energies and forces that belong together."""
     with torch.no_grad():
         energies = teacher.members(one.positions_nm, one.topology).mean(-1).float()
-    return replace(one, energies=energies, forces=teacher.member_forces(one.positions_nm, one.topology)[0].float())
+    return replace(one, energies=energies, forces=teacher.member_forces(one.positions_nm, one.topology).mean(0).float())
 
 
 @pytest.fixture
 def model() -> PainetPotential:
-    torch.manual_seed(1)
+    return potential(1)
+
+
+def potential(seed: int) -> PainetPotential:
+    torch.manual_seed(seed)
     model = PainetPotential(PotentialConfig(width=16, n_members=2))
     with torch.no_grad():
         for parameter in model.parameters():
@@ -66,8 +70,7 @@ def test_a_batch_of_molecules_has_the_energies_and_forces_of_each(model: PainetP
 
 
 def test_training_on_a_batch_brings_the_forces_nearer(model: PainetPotential) -> None:
-    torch.manual_seed(2)
-    teacher = PainetPotential(PotentialConfig(width=16, n_members=1))
+    teacher = potential(2)
     learned = [taught_by(teacher, labelled(*kind, n=8)) for kind in (ETHANOL, ACETATE)]
     learner = Learner(model, learned, learned, 4, 4, torch.device("cpu"))
     optimiser, generator = torch.optim.Adam(model.parameters(), 3e-3), torch.Generator().manual_seed(0)
@@ -76,7 +79,9 @@ def test_training_on_a_batch_brings_the_forces_nearer(model: PainetPotential) ->
         optimiser.zero_grad()
         learner.loss(generator)[0].backward(inputs=[*model.parameters()])
         optimiser.step()
-    assert learner.errors()["validation_force_kcal"] < 0.8 * before
+    # Nearer than no forces at all, too.
+    none = float(np.mean([float(one.forces.abs().mean()) for one in learned])) / KJ_MOL_NM_PER_KCAL_MOL_A
+    assert learner.errors()["validation_force_kcal"] < 0.3 * min(before, none)
 
 
 def test_compact_labels_are_the_labels(tmp_path) -> None:
