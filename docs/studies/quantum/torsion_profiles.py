@@ -1,11 +1,12 @@
 """Torsion profiles of potentials against GFN2-xTB's.
 
     python docs/studies/quantum/torsion_profiles.py WEIGHTS... [-o docs/results/tables/torsion_profiles.json]
-    python docs/studies/quantum/torsion_profiles.py drug-like-gfn2-xtb --unseen 20 [-o ...]
+    python docs/studies/quantum/torsion_profiles.py NAME --unseen 20 [--tuned "FOLDER/tuned_{}_180s.safetensors"]
 
 Each rotatable bond, methyl and hydroxyl included, is turned rigidly in 24 steps from GFN2-xTB's minimum. Energies are
 compared, less their mean, where GFN2-xTB's are below 25 kJ/mol. `--unseen`: of so many test molecules of
-docs/studies/training/drug_like.tsv, a line each.
+docs/studies/training/drug_like.tsv, a line each. `--tuned`: each by its own weights, named by its place in that list,
+as `drug_like_potential.py tune` leaves them.
 """
 
 from __future__ import annotations
@@ -48,15 +49,17 @@ def minimum(scene: Scene) -> FloatArray:
 LIST = Path(__file__).parents[1] / "training" / "drug_like.tsv"
 
 
-def unseen(name: str, n: int) -> list[list[str]]:
+def unseen(name: str, n: int, tuned: str | None) -> list[list[str]]:
     """Return a line for each of so many test molecules with a torsion."""
     weights, found, offs = load_weights(weights_path(name)), [], []
-    for smiles, split, *_ in (line.split("\t") for line in LIST.read_text("utf-8").splitlines()):
+    for number, line in enumerate(LIST.read_text("utf-8").splitlines()[1:]):
+        smiles, split, *_ = line.split("\t")
         if split != "test" or len(found) == n:
             continue
         try:
             scene = prepare(f"smiles:{smiles}")
-            lines = [off for _, _, off in profiles(scene, weights.model.eval())]
+            model = (weights if tuned is None else load_weights(Path(tuned.format(number)))).model
+            lines = [off for _, _, off in profiles(scene, model.eval())]
         except SurromdError as error:
             sys.stderr.write(f"{smiles}: {error}\n")
             continue
@@ -100,8 +103,13 @@ def main() -> None:
     parser.add_argument("weights", nargs="+")
     parser.add_argument("-o", "--out", type=Path)
     parser.add_argument("--unseen", type=int, default=0)
+    parser.add_argument("--tuned", metavar="NAME_WITH_{}")
     given = parser.parse_args()
-    found = [line for name in given.weights for line in (unseen(name, given.unseen) if given.unseen else rows(name))]
+    found = [
+        line
+        for name in given.weights
+        for line in (unseen(name, given.unseen, given.tuned) if given.unseen else rows(name))
+    ]
     for line in found:
         sys.stdout.write(" | ".join(line) + "\n")
     if given.out is not None:

@@ -15,7 +15,7 @@ on the weights, at 300 K, of held-out molecules, and how many of such frames cou
 GFN2-xTB's law. `trust` rolls molecules that are neither, measures
 where the members' spread (`sampling.domain`) tells those that fly apart, and writes that limit into the weights.
 `stability` rolls held-out molecules that the weights then do not refuse. `tune` trains on held-out molecules one by
-one, beginning with the weights and with nothing, as `surromd train` does.
+one, beginning with the weights, as `surromd train` does.
 """
 
 from __future__ import annotations
@@ -492,21 +492,20 @@ def stability(given: argparse.Namespace) -> None:
 
 
 def tune(given: argparse.Namespace) -> None:
-    """Print errors of forces after so much training on one molecule, from the weights and from nothing."""
+    """Print errors of forces after so much training on one molecule, as `surromd train` does it; keep the weights."""
     for one in load(given.folder, ["test"], given.molecules):
-        found = []
-        for seconds in given.seconds:
-            for start in (given.weights, None):
-                out = given.weights.with_name("tuned.safetensors")
-                sm.train(f"smiles:{one.entry.smiles}", out, level="gfn2-xtb", start_from=start, budget_s=seconds,
-                         seed=SEED, quiet=True, overwrite=True)  # fmt: skip
-                model = load_weights(out).model
-                assert isinstance(model, PainetPotential)
-                force = errors_of(model, one, 80)[0]
-                found.append(f"{seconds:g} s from {'nothing' if start is None else 'these'} {force:.2f}")
-        model = load_weights(given.weights).model
-        assert isinstance(model, PainetPotential)
-        said(f"{one.entry.smiles}: untuned {errors_of(model, one, 80)[0]:.2f}, {', '.join(found)} kcal/mol/Å")
+        number, found = read_list().index(one.entry), []
+        for seconds in (0.0, *given.seconds):
+            weights = given.weights
+            if seconds:
+                weights = given.folder / f"tuned_{number}_{seconds:g}s.safetensors"
+                if not weights.exists():
+                    sm.train(f"smiles:{one.entry.smiles}", weights, level="gfn2-xtb", start_from=given.weights,
+                             budget_s=seconds, seed=SEED, quiet=True)  # fmt: skip
+            model = load_weights(weights).model
+            assert isinstance(model, PainetPotential)
+            found.append(f"{seconds:g} s {errors_of(model, one, 80)[0]:.2f}")
+        said(f"{one.entry.smiles}: {', '.join(found)} kcal/mol/Å")
 
 
 def said(line: str) -> None:
