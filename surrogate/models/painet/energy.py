@@ -22,6 +22,7 @@ import numpy as np
 import numpy.typing as npt
 import torch
 from torch import Tensor, nn
+from torch.nn import functional as F
 
 from md_reference import simd as engine
 from surrogate.models.painet.model import EnergyAttention, TypeGroups, bond_paths, check_attention, type_groups
@@ -264,7 +265,7 @@ class Look(nn.Module):
         self.c, n = c, c.n_scalars + c.n_vectors + c.n_tensors
         self.of_edge = nn.Linear(c.width, c.n_radial * n)
         self.send = None if first else nn.Linear(c.width, c.n_scalars + c.n_vectors)
-        n_vectors = c.n_vectors + n_carried
+        self.n_vectors = n_vectors = c.n_vectors + n_carried
         n_invariants = c.n_scalars + n_vectors**2 + c.n_tensors * (c.n_tensors + n_vectors)
         self.update = nn.Sequential(
             nn.Linear(c.width + n_invariants, c.width), nn.SiLU(), nn.Linear(c.width, c.width), nn.SiLU(),
@@ -275,6 +276,14 @@ class Look(nn.Module):
         """Features of edges (n_edges, width) -> weights of their radial functions."""
         c = self.c
         return self.of_edge(of_edge).unflatten(-1, (c.n_radial, -1)) * (2.0 / c.n_radial**0.5)
+
+    def once(self) -> Tensor:
+        """Return the first weights of `update` where none of the invariants comes twice: of products i <= j alone."""
+        c, n = self.c, self.n_vectors
+        sizes = c.width + c.n_scalars, n * n, c.n_tensors * (c.n_tensors + n)
+        plain, of_vectors, of_tensors = cast(Tensor, self.update[0].weight).split(sizes, dim=1)
+        both = (_once(of_vectors.unflatten(1, (n, n))), _once(of_tensors.unflatten(1, (c.n_tensors, -1))))
+        return torch.cat([plain, *both], dim=1)
 
     def forward(self, h: Tensor, carried: Tensor | None, seen: EdgeGeometry, edges: Edges, weights: Tensor) -> Tensor:
         """`h` (n, rows, width), `carried` vectors (n, rows, 3, n_carried) -> h."""
@@ -292,6 +301,14 @@ class Look(nn.Module):
         squares = products(v.transpose(-1, -2)).transpose(-1, -2)
         invariants = (_gram(v, v), _gram(t, torch.cat([t, squares], dim=-1)))
         return h + self.update(torch.cat([h, felt, *(i.flatten(-2) for i in invariants)], dim=-1))
+
+
+def _once(weight: Tensor) -> Tensor:
+    """`weight` (.., n, m) of n x m products of which the first n x n are symmetric -> (.., those with i <= j)."""
+    n, m = weight.shape[-2:]
+    below = weight[..., :n].tril(-1).transpose(-1, -2)
+    i, j = torch.triu_indices(n, m)
+    return (weight + F.pad(below, (0, m - n)))[..., i, j]
 
 
 def _gram(a: Tensor, b: Tensor) -> Tensor:
@@ -440,13 +457,17 @@ class SimdPotential:
             phi, psi = (m[:, types][:, :, types] for m in attention.type_matrices())
             dense = (look.update[0], look.update[2], look.update[4], attention.qkv, attention.out)
             linear = [self._linear(layer) for layer in (look.send, *dense)]
+            linear[1] = self._linear(look.update[0], look.once())
             steps.append(_Step(*linear, self._array(phi), self._array(psi)))
         edges, shell = made.edges, made.edges.shell
         begin, spacing = radial_grid(config.n_radial, config.cutoff_nm, made.of_atom)
         per_cutoff2 = torch.where(shell == N_SHELLS - 1, config.cutoff_nm**-2, 0.0)
         pairs = (begin[shell], 1.0 / spacing[shell], per_cutoff2, 1.0 / made.nearest_nm[:, 0].clamp(min=LEAST_NM),
                  1.0 / made.farthest_nm[:, 0])  # fmt: skip
-        seen = torch.cat([*made.looks, 0.5 * made.table], dim=-1)
+        seen = torch.cat(made.looks, dim=-1)
+        of_pair = 0.5 * made.table.unflatten(0, (n, n))
+        tables = of_pair + of_pair.transpose(0, 1)
+        tables = torch.cat([tables, tables.mean(-1, keepdim=True)], dim=-1)
         last = cast(nn.Linear, network.site[2])
         members = torch.cat([last.weight, last.bias[:, None], network.latent.T / n**2], dim=-1)
         assert edges.dense
@@ -454,12 +475,12 @@ class SimdPotential:
         class Network(ctypes.Structure):
             _fields_ = [
                 ("n", ctypes.c_int64), ("steps", _Step * config.n_steps), ("site", _Linear),
-                *((name, ctypes.c_void_p) for name in ("members", "of_atom", "edges", "pairs")),
+                *((name, ctypes.c_void_p) for name in ("members", "of_atom", "edges", "tables", "pairs")),
                 ("eta", ctypes.c_float), ("wall", ctypes.c_float),
             ]  # fmt: skip
 
         read_out = torch.cat([members, members.mean(0, keepdim=True)])
-        arrays = (read_out, made.of_atom, seen.transpose(1, 2), torch.stack(pairs, dim=-1))
+        arrays = (read_out, made.of_atom, seen, tables, torch.stack(pairs, dim=-1))
         places = (self._array(array) for array in arrays)
         self._network = Network(
             n, (_Step * config.n_steps)(*steps), self._linear(network.site[0]), *places, config.step, WALL
@@ -528,10 +549,11 @@ class SimdPotential:
         self._kept.append(np.ascontiguousarray(values.detach().numpy(), dtype=np.float32))
         return self._kept[-1].ctypes.data
 
-    def _linear(self, layer: Any) -> _Linear:
+    def _linear(self, layer: Any, weight: Tensor | None = None) -> _Linear:
         if layer is None:
             return _Linear()
-        return _Linear(self._array(layer.weight), self._array(layer.weight.T), self._array(layer.bias))
+        weight = layer.weight if weight is None else weight
+        return _Linear(self._array(weight), self._array(weight.T), self._array(layer.bias))
 
 
 def simd_potential_of(network: EnergyNetwork, topology: Topology, made: EdgeWeights, rows: int, unit: float = 1.0,

@@ -9,7 +9,7 @@
 
 #define N_SENT (N_SCALARS + N_VECTORS)
 #define N_FOUND (N_SCALARS + N_VECTORS + N_TENSORS)
-#define N_EDGE (N_STEPS * N_FOUND + N_MEMBERS)
+#define N_EDGE (N_STEPS * N_FOUND)
 #define N_ATTENDED (N_HEADS * HEAD_DIM)
 
 static const float HALF_WIDTH = 2.5f, SOFTENING_NM2 = 1e-8f, ROOT_TWO = 1.41421356f, LEAST_NORM = 1e-12f;
@@ -27,7 +27,8 @@ struct Network {
     Linear site;
     const float *members;  // [N_MEMBERS + 1][WIDTH + 1 + N_HEADS]: of the site, its bias, of the latent energy; their mean
     const float *of_atom;  // [n][WIDTH]
-    const float *edges;    // [n][n][N_EDGE][N_RADIAL]: all looks, then half of each member's table
+    const float *edges;    // [n][n][N_RADIAL][N_EDGE]: all looks
+    const float *tables;   // [n][n][N_RADIAL][N_MEMBERS + 1]: each member's, of both directions, and their mean
     const float *pairs;    // [n][n][5]: log of the range's begin, 1/spacing, 1/cutoff^2, 1/nearest, 1/farthest
     float eta, wall;
 };
@@ -35,7 +36,8 @@ struct Network {
 // What a step keeps for its way back; `dh` and the like are gradients.
 #define CARRIED(s) ((s) ? N_HEADS : 0)
 #define ALL_VECTORS(s) (N_VECTORS + CARRIED(s))
-#define N_INPUT(s) (WIDTH + N_SCALARS + ALL_VECTORS(s) * ALL_VECTORS(s) + N_TENSORS * (N_TENSORS + ALL_VECTORS(s)))
+#define N_TWO(n) ((n) * ((n) + 1) / 2)
+#define N_INPUT(s) (WIDTH + N_SCALARS + N_TWO(ALL_VECTORS(s)) + N_TWO(N_TENSORS) + N_TENSORS * ALL_VECTORS(s))
 #define MOST_INPUT N_INPUT(1)
 
 struct Kept {
@@ -82,8 +84,13 @@ static inline void block(const float *w, const float *bias, int n_in, int in_str
 
 template <int A>
 static inline void row_of_blocks(const float *w, const float *b, int n_in, int in_stride, int n_out, const V *in, V *out) {
+#ifdef AVX512
+    const int O = 6;  // 24 sums, as many as registers hold
+#else
+    const int O = 4;
+#endif
     int o = 0;
-    for (; o + 4 <= n_out; o += 4) block<A, 4>(w + o * n_in, b ? b + o : 0, n_in, in_stride, n_out, in, out + o);
+    for (; o + O <= n_out; o += O) block<A, O>(w + o * n_in, b ? b + o : 0, n_in, in_stride, n_out, in, out + o);
     for (; o < n_out; o++) block<A, 1>(w + o * n_in, b ? b + o : 0, n_in, in_stride, n_out, in, out + o);
 }
 
@@ -106,14 +113,19 @@ static inline void products_back(const V x, const V y, const V z, const V *d, in
     *dz += 2.0f * z * zz + ROOT_TWO * (y * yz + x * xz);
 }
 
-// An edge as all looks see it; `log` and `apart` are what its way back needs.
-struct Edge { V apart[3], distance, log, radial[N_RADIAL], shape[9]; };
+// A pair i < j as all looks see it, from j to i; radial functions but those from `first` to `last` are zero in all copies.
+struct Edge { V apart[3], distance, log, radial[N_RADIAL], shape[9]; int64_t first, last; };
+
+static inline int64_t place(int64_t n, int64_t i, int64_t j) { return i < j ? i * n + j : j * n + i; }
+
+// Where a pair is on its grid of radial functions.
+static inline V on_grid(const Edge *e, const float *p) { return (e->log - p[0]) * p[1]; }
+static inline V within_cutoff(const Edge *e, const float *p) { return above_zero(1.0f - p[2] * e->distance * e->distance); }
 
 static void measure(const Network *net, const D *x, Edge *edges, V *energy) {
     const int64_t n = net->n;
     for (int64_t i = 0; i < n; i++)
-        for (int64_t j = 0; j < n; j++) {
-            if (i == j) continue;
+        for (int64_t j = i + 1; j < n; j++) {
             Edge *e = edges + i * n + j;
             const float *p = net->pairs + 5 * (i * n + j);
             V square = splat(SOFTENING_NM2);
@@ -122,29 +134,32 @@ static void measure(const Network *net, const D *x, Edge *edges, V *energy) {
                 square += e->apart[a] * e->apart[a];
             }
             e->distance = root(square), e->log = log_ratio(e->distance);
-            const V inside = above_zero(1.0f - p[2] * e->distance * e->distance), cube = inside * inside * inside;
-            for (int k = 0; k < N_RADIAL; k++) {
-                const V u = ((e->log - p[0]) * p[1] - (float)k) / HALF_WIDTH, bump = above_zero(1.0f - u * u);
+            const V near = above_zero(1.0f - p[3] * e->distance), far = above_zero(p[4] * e->distance - 1.0f);
+            *energy += 2.0f * net->wall * (near * near * near + far * far * far);
+            const V inside = within_cutoff(e, p), cube = inside * inside * inside, at = on_grid(e, p);
+            const float least = -largest<float>(-at) - HALF_WIDTH, most = largest<float>(at) + HALF_WIDTH;
+            e->first = least > 0.0f ? (int64_t)least : 0;
+            e->last = most < N_RADIAL - 1 ? (int64_t)(most + 1.0f) : N_RADIAL;
+            if (!any(inside > 0.0f) || e->last < e->first) e->last = e->first;
+            for (int64_t k = e->first; k < e->last; k++) {
+                const V u = (at - (float)k) / HALF_WIDTH, bump = above_zero(1.0f - u * u);
                 e->radial[k] = bump * bump * bump * cube;
             }
             for (int a = 0; a < 3; a++) e->shape[a] = e->apart[a] / e->distance;
             products(e->shape[0], e->shape[1], e->shape[2], e->shape + 3, 1);
-            const V near = above_zero(1.0f - p[3] * e->distance), far = above_zero(p[4] * e->distance - 1.0f);
-            *energy += net->wall * (near * near * near + far * far * far);
         }
 }
 
 static void measure_back(const Network *net, const Edge *edges, const V *d_radial, const V *d_shape, Vu *grad) {
     const int64_t n = net->n;
     for (int64_t i = 0; i < n; i++)
-        for (int64_t j = 0; j < n; j++) {
-            if (i == j) continue;
+        for (int64_t j = i + 1; j < n; j++) {
             const Edge *e = edges + i * n + j;
             const float *p = net->pairs + 5 * (i * n + j);
-            const V inside = above_zero(1.0f - p[2] * e->distance * e->distance), square = inside * inside;
+            const V inside = within_cutoff(e, p), square = inside * inside, at = on_grid(e, p);
             V d_log = splat(0.0f), d_inside = splat(0.0f);
-            for (int k = 0; k < N_RADIAL; k++) {
-                const V u = ((e->log - p[0]) * p[1] - (float)k) / HALF_WIDTH, bump = above_zero(1.0f - u * u);
+            for (int64_t k = e->first; k < e->last; k++) {
+                const V u = (at - (float)k) / HALF_WIDTH, bump = above_zero(1.0f - u * u);
                 const V d = d_radial[(i * n + j) * N_RADIAL + k] * 3.0f * bump * bump * square;
                 d_log -= d * inside * u;
                 d_inside += d * bump;
@@ -156,7 +171,7 @@ static void measure_back(const Network *net, const Edge *edges, const V *d_radia
             const V along = way[0] * e->shape[0] + way[1] * e->shape[1] + way[2] * e->shape[2];
             const V d_distance = (d_log * (2.0f * p[1] / HALF_WIDTH) - along) / e->distance
                 - 2.0f * p[2] * e->distance * d_inside
-                + 3.0f * net->wall * (p[4] * far * far - p[3] * near * near);
+                + 6.0f * net->wall * (p[4] * far * far - p[3] * near * near);
             for (int a = 0; a < 3; a++) {
                 const V g = way[a] / e->distance + d_distance * e->shape[a];
                 grad[3 * i + a] += g;
@@ -165,13 +180,43 @@ static void measure_back(const Network *net, const Edge *edges, const V *d_radia
         }
 }
 
-// Channels of look s at an edge, before they are modulated by what the sender sends.
-static inline void see(const Network *net, int64_t edge, int s, const Edge *e, V *found) {
-    const float *w = net->edges + (edge * N_EDGE + s * N_FOUND) * N_RADIAL;
-    for (int c = 0; c < N_FOUND; c++) {
-        V sum = splat(0.0f);
-        for (int k = 0; k < N_RADIAL; k++) sum += w[c * N_RADIAL + k] * e->radial[k];
-        found[c] = sum;
+// Sums of a copy have one order, however many functions the copies beside it need: unrolled whole, the compiler has its own.
+template <int C> static inline void channels(const float *w, const Edge *e, V *found) {
+    V sum[C] = {};
+    _Pragma("GCC unroll 1") for (int64_t k = e->first; k < e->last; k++)
+        for (int c = 0; c < C; c++) sum[c] += w[k * N_EDGE + c] * e->radial[k];
+    memcpy(found, sum, sizeof sum);
+}
+
+template <int K> static inline void functions(const float *w, const V *d_found, V *d_radial) {
+    V sum[K];
+    memcpy(sum, d_radial, sizeof sum);
+    _Pragma("GCC unroll 1") for (int c = 0; c < N_FOUND; c++)
+        for (int k = 0; k < K; k++) sum[k] += w[k * N_EDGE + c] * d_found[c];
+    memcpy(d_radial, sum, sizeof sum);
+}
+
+// Channels of a look at an edge, before they are modulated by what the sender sends.
+static inline void see(const float *w, const Edge *e, V *found) {
+    int c = 0;
+    for (; c + 14 <= N_FOUND; c += 14) channels<14>(w + c, e, found + c);
+    for (; c + 7 <= N_FOUND; c += 7) channels<7>(w + c, e, found + c);
+    for (; c < N_FOUND; c++) channels<1>(w + c, e, found + c);
+}
+
+// Their gradient -> that of radial functions.
+static inline void see_back(const float *w, const Edge *e, const V *d_found, V *d_radial) {
+    int64_t k = e->first;
+    for (; k + 8 <= e->last; k += 8) functions<8>(w + k * N_EDGE, d_found, d_radial + k);
+    w += k * N_EDGE, d_radial += k;
+    switch (e->last - k) {
+        case 7: return functions<7>(w, d_found, d_radial);
+        case 6: return functions<6>(w, d_found, d_radial);
+        case 5: return functions<5>(w, d_found, d_radial);
+        case 4: return functions<4>(w, d_found, d_radial);
+        case 3: return functions<3>(w, d_found, d_radial);
+        case 2: return functions<2>(w, d_found, d_radial);
+        case 1: return functions<1>(w, d_found, d_radial);
     }
 }
 
@@ -187,15 +232,16 @@ static void look(const Network *net, const Edge *edges, const V *h, const V *car
     for (int64_t i = 0; i < n; i++) {
         V felt[N_SCALARS] = {}, v[3][NV] = {}, t[6][N_TENSORS] = {};
         for (int64_t j = 0; j < n; j++) {
-            if (i == j) continue;
-            const Edge *e = edges + i * n + j;
+            const Edge *e = edges + place(n, i, j);
+            if (i == j || e->first == e->last) continue;
             V found[N_FOUND];
-            see(net, i * n + j, S, e, found);
+            see(net->edges + (i * n + j) * N_RADIAL * N_EDGE + S * N_FOUND, e, found);
+            const float side = i < j ? 1.0f : -1.0f;
             if (S)
                 for (int c = 0; c < N_SENT; c++) found[c] *= kept->sent[j * N_SENT + c];
             for (int c = 0; c < N_SCALARS; c++) felt[c] += found[c];
             for (int a = 0; a < 3; a++)
-                for (int c = 0; c < N_VECTORS; c++) v[a][c] += e->shape[a] * found[N_SCALARS + c];
+                for (int c = 0; c < N_VECTORS; c++) v[a][c] += side * e->shape[a] * found[N_SCALARS + c];
             for (int a = 0; a < 6; a++)
                 for (int c = 0; c < N_TENSORS; c++) t[a][c] += e->shape[3 + a] * found[N_SENT + c];
         }
@@ -209,9 +255,9 @@ static void look(const Network *net, const Edge *edges, const V *h, const V *car
         memcpy(in, felt, sizeof felt);
         in += N_SCALARS;
         for (int a = 0; a < NV; a++)
-            for (int b = 0; b < NV; b++) *in++ = v[0][a] * v[0][b] + v[1][a] * v[1][b] + v[2][a] * v[2][b];
+            for (int b = a; b < NV; b++) *in++ = v[0][a] * v[0][b] + v[1][a] * v[1][b] + v[2][a] * v[2][b];
         for (int a = 0; a < N_TENSORS; a++) {
-            for (int b = 0; b < N_TENSORS + NV; b++) {
+            for (int b = a; b < N_TENSORS + NV; b++) {
                 V sum = splat(0.0f);
                 for (int k = 0; k < 6; k++) sum += t[k][a] * (b < N_TENSORS ? t[k][b] : squares[k][b - N_TENSORS]);
                 *in++ = sum;
@@ -236,16 +282,21 @@ static void look_back(const Network *net, const Edge *edges, const Kept *kept, c
         for (int c = 0; c < NV; c++) products(v[0][c], v[1][c], v[2][c], squares[0] + c, NV);
         d += N_SCALARS;
         for (int a = 0; a < NV; a++)
-            for (int b = 0; b < NV; b++) {
-                const V both = d[a * NV + b] + d[b * NV + a];
-                for (int k = 0; k < 3; k++) dv[k][a] += both * v[k][b];
+            for (int b = a; b < NV; b++) {
+                const V one = *d++;
+                for (int k = 0; k < 3; k++) {
+                    dv[k][a] += one * v[k][b];
+                    dv[k][b] += one * v[k][a];
+                }
             }
-        d += NV * NV;
         for (int a = 0; a < N_TENSORS; a++)
-            for (int b = 0; b < N_TENSORS + NV; b++) {
-                const V one = d[a * (N_TENSORS + NV) + b];
+            for (int b = a; b < N_TENSORS + NV; b++) {
+                const V one = *d++;
                 if (b < N_TENSORS)
-                    for (int k = 0; k < 6; k++) dt[k][a] += (one + d[b * (N_TENSORS + NV) + a]) * t[k][b];
+                    for (int k = 0; k < 6; k++) {
+                        dt[k][a] += one * t[k][b];
+                        dt[k][b] += one * t[k][a];
+                    }
                 else
                     for (int k = 0; k < 6; k++) {
                         dt[k][a] += one * squares[k][b - N_TENSORS];
@@ -257,16 +308,17 @@ static void look_back(const Network *net, const Edge *edges, const Kept *kept, c
         for (int a = 0; S && a < 3; a++)
             for (int c = 0; c < N_HEADS; c++) d_carried[(i * 3 + a) * N_HEADS + c] = dv[a][N_VECTORS + c];
         for (int64_t j = 0; j < n; j++) {
-            if (i == j) continue;
-            const int64_t edge = i * n + j;
-            const Edge *e = edges + edge;
+            const int64_t pair = place(n, i, j);
+            const Edge *e = edges + pair;
+            if (i == j || e->first == e->last) continue;
+            const float *w = net->edges + (i * n + j) * N_RADIAL * N_EDGE + S * N_FOUND, side = i < j ? 1.0f : -1.0f;
             V found[N_FOUND], d_found[N_FOUND], shape[9] = {};
-            see(net, edge, S, e, found);
+            see(w, e, found);
             for (int c = 0; c < N_SCALARS; c++) d_found[c] = felt[c];
             for (int c = 0; c < N_VECTORS; c++) {
                 V sum = splat(0.0f);
                 for (int a = 0; a < 3; a++) sum += e->shape[a] * dv[a][c];
-                d_found[N_SCALARS + c] = sum;
+                d_found[N_SCALARS + c] = side * sum;
             }
             for (int c = 0; c < N_TENSORS; c++) {
                 V sum = splat(0.0f);
@@ -284,13 +336,8 @@ static void look_back(const Network *net, const Edge *edges, const Kept *kept, c
                 for (int c = 0; c < N_VECTORS; c++) shape[a] += dv[a][c] * found[N_SCALARS + c];
             for (int a = 0; a < 6; a++)
                 for (int c = 0; c < N_TENSORS; c++) shape[3 + a] += dt[a][c] * found[N_SENT + c];
-            const float *w = net->edges + (edge * N_EDGE + S * N_FOUND) * N_RADIAL;
-            V radial[N_RADIAL];
-            memcpy(radial, d_radial + edge * N_RADIAL, sizeof radial);
-            for (int c = 0; c < N_FOUND; c++)
-                for (int k = 0; k < N_RADIAL; k++) radial[k] += w[c * N_RADIAL + k] * d_found[c];
-            memcpy(d_radial + edge * N_RADIAL, radial, sizeof radial);
-            for (int a = 0; a < 9; a++) d_shape[edge * 9 + a] += shape[a];
+            see_back(w, e, d_found, d_radial + pair * N_RADIAL);
+            for (int a = 0; a < 9; a++) d_shape[pair * 9 + a] += a < 3 ? side * shape[a] : shape[a];
         }
     }
 }
@@ -533,20 +580,14 @@ void evaluate(const Network *net, const double *positions, float *energy, float 
         total[m] = sum;
     }
     // The tables, whose mean's gradient begins those of radial functions.
-    memset((void *)b.d_radial, 0, sizeof(V) * n * n * N_RADIAL);
     memset((void *)b.d_shape, 0, sizeof(V) * n * n * 9);
-    for (int64_t edge = 0; edge < n * n; edge++) {
-        if (edge % (n + 1) == 0) continue;
-        const float *w = net->edges + (edge * N_EDGE + N_STEPS * N_FOUND) * N_RADIAL;
-        for (int k = 0; k < N_RADIAL; k++) {
-            float mean = 0.0f;
-            for (int m = 0; m < N_MEMBERS; m++) {
-                total[m] += w[m * N_RADIAL + k] * edges[edge].radial[k];
-                mean += w[m * N_RADIAL + k] / N_MEMBERS;
+    for (int64_t i = 0; i < n; i++)
+        for (int64_t pair = i * n + i + 1; pair < (i + 1) * n; pair++)
+            for (int64_t k = edges[pair].first; k < edges[pair].last; k++) {
+                const float *w = net->tables + (pair * N_RADIAL + k) * (N_MEMBERS + 1);
+                for (int m = 0; m < N_MEMBERS; m++) total[m] += w[m] * edges[pair].radial[k];
+                b.d_radial[pair * N_RADIAL + k] = splat(w[N_MEMBERS]);
             }
-            b.d_radial[edge * N_RADIAL + k] = splat(mean);
-        }
-    }
 
     for (int64_t i = 0; i < n; i++)
         for (int c = 0; c < WIDTH; c++)
