@@ -240,7 +240,8 @@ def compare(
         known, convergence,
     )  # fmt: skip
     own = list(zip(measured[1 : 1 + n], summaries[1 : 1 + n], rolled, strict=True))
-    evaluations = tuple(_evaluate(setting, m, summary) for m, summary, _ in own)
+    known_turned = any(map(_is_turned, thinned[:1] if rep is None else (ref, rep)))
+    evaluations = tuple(_evaluate(setting, m, summary, known_turned or _is_turned(e)) for m, summary, e in own)
     notes += [f"Validity check left out: {x}." for x in baseline.geometry.excluded]
     return Comparison(
         scene_name=stage.name,
@@ -269,11 +270,19 @@ def _start_notes(candidates: Sequence[Features], torsions: Backbone, seed: int) 
     return [f"{label} itself is {found.verdict}" for label, found in tested if found.n_replicas and not found.converged]
 
 
-def _evaluate(setting: _Setting, candidate: Features, summary: Summary) -> Evaluation:
-    """Evaluate one candidate; `summary`: what its file says of it."""
+def _is_turned(ensemble: Ensemble) -> bool:
+    return bool(ensemble.record.get("torsion_moves"))
+
+
+def _evaluate(setting: _Setting, candidate: Features, summary: Summary, turned: bool) -> Evaluation:
+    """Evaluate one candidate; `summary`: what its file says of it. `turned`: torsions were, by Monte Carlo, here or in
+    the reference, so that no kinetics are compared."""
     inputs, correlation, own = _equal_terms(setting, candidate)
     reference, replicate, options = setting.reference, setting.replicate, setting.options
-    found_rows, charts, skipped = measure_all(METRICS, inputs)
+    metrics = [m for m in METRICS if not (turned and m.kind == "kinetics")]
+    found_rows, charts, skipped = measure_all(metrics, inputs)
+    if turned:
+        skipped = [*skipped, ("Kinetics", "torsions were turned by Monte Carlo moves")]
     n_compared = round(inputs.compared_ps / inputs.lag_ps)
     left_open = explain(setting.known, candidate, setting.torsions, setting.convergence, seed=options.seed)
     if effective_samples(n_compared, correlation) < verdict.LEAST_FOR_TESTS or left_open.why:
@@ -285,6 +294,7 @@ def _evaluate(setting: _Setting, candidate: Features, summary: Summary) -> Evalu
     status = verdict.status(rows, cautions)
     # A reference that may be elsewhere than MD ends gives no equivalent MD time.
     times = () if left_open.why else equivalent_times(reference, candidate, replicate, setting.torsions, options.seed)
+    times = tuple(each for each in times if not (turned and each.kind == "kinetics"))
     known = effective_samples(min(reference.n_frames, replicate.n_frames), correlation)
     words = ""
     if status != "broken" and not (cautions.apart or cautions.copied) and known >= verdict.LEAST_FOR_EQUIVALENT_TIME:

@@ -106,6 +106,11 @@ class Answer:
         return self.energies[0] > 0
 
     @property
+    def relaxation_ps(self) -> tuple[float, ...]:
+        """Relaxation times of MD; none of a reweighted rollout, whose torsions Monte Carlo turns."""
+        return () if self.is_reweighted else self.timescales_ps
+
+    @property
     def whose(self) -> str:
         """Whose populations these are, before the noun."""
         return "the reweighted" if self.is_reweighted else "MD's"
@@ -150,12 +155,12 @@ class Answer:
             use = "Use the reweighted rollout" if self.is_reweighted else "Use MD's answer"
             use += ", but for what it did not connect." if self.missing else "."
             what = f"For populations and free energies of {len(weighted)} states, each to {widest:.2g} % or better"
-            what += " (one standard error)" + (", and relaxation times." if self.timescales_ps else ".")
+            what += " (one standard error)" + (", and relaxation times." if self.relaxation_ps else ".")
         missing = f" Missing: {'; '.join(self.missing)}." if self.missing and not self.is_by_surrogate else ""
         slow = ""
-        if self.timescales_ps:
+        if self.relaxation_ps:
             error = f" ± {format_time_ps(self.timescale_errors_ps[0], 2)}" if self.timescale_errors_ps else ""
-            slow = f"; the slowest process takes {format_time_ps(self.timescales_ps[0], 2)}{error}"
+            slow = f"; the slowest process takes {format_time_ps(self.relaxation_ps[0], 2)}{error}"
         length = f"{self.n_replicas} replicas of {format_time_ps(self.replica_ps, 2)}"
         length += ", each with its mirror image" * self.has_images
         if self.is_by_surrogate:
@@ -203,6 +208,8 @@ class Answer:
             "states": states,
             "maps_kj_mol": maps,
         }
+        if self.is_reweighted:
+            own |= {"timescales_ps": [], "timescale_errors_ps": []}
         return {k: list(v) if isinstance(v, tuple) else v for k, v in found.items()} | own
 
     def table(self) -> list[tuple[str, str]]:

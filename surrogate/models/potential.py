@@ -14,6 +14,7 @@ from torch import Tensor
 
 from surrogate.models.architecture import ModelConfig
 from surrogate.models.propagator import Chunk, Molecule, Propagator
+from systems.chemistry.graph import beyond, bonded_graph, rotatable_torsions
 from systems.errors import InputError
 from systems.scene import Scene
 from systems.units import GAS_CONSTANT_KJ_MOL_K, whole_steps
@@ -37,7 +38,8 @@ class IntegratorConfig(ModelConfig):
 
     A chunk is `n_new` frames `lag_ps` apart, in steps of `timestep_ps`, in a Langevin bath at `temperature_k`
     with `friction_per_ps`, or with `ensemble` 'nve' without one; hydrogens weigh `hydrogen_mass_da`, if any is given.
-    As of reference MD, steps are of 4 fs, hydrogens of 3 Da and their bonds rigid (`constrain_hydrogens`).
+    As of reference MD, steps are of 4 fs, hydrogens of 3 Da and their bonds rigid (`constrain_hydrogens`). Before each
+    frame so many `torsion_moves` of Monte Carlo are tried.
     """
 
     n_new: int = 10
@@ -47,10 +49,13 @@ class IntegratorConfig(ModelConfig):
     friction_per_ps: float = 1.0
     ensemble: str = "nvt"
     hydrogen_mass_da: float | None = 3.0
+    torsion_moves: int = 0
 
     def __post_init__(self) -> None:
         if self.ensemble not in ("nvt", "nve"):
             raise InputError(f"ensemble = {self.ensemble!r} is unknown to a learned potential; choose nvt or nve.")
+        if self.torsion_moves and self.ensemble == "nve":
+            raise InputError("torsion moves are of a temperature: leave `torsion_moves` out, or the ensemble 'nve'.")
         if self.n_new < 1:
             raise InputError(f"n_new = {self.n_new} must be at least 1.")
 
@@ -80,14 +85,63 @@ class Bath(NamedTuple):
     rigid: RigidBonds | None
 
 
+class Turns(NamedTuple):
+    """Bonds that torsion moves turn: their two atoms `ends` (k, 2), and which atoms turn with the second, `side`
+    (k, n_atoms), the fewer."""
+
+    ends: Tensor
+    side: Tensor
+
+    @staticmethod
+    def of(scene: Scene) -> Turns:
+        """Return a molecule's rotatable bonds, hydroxyl's and the like among them, but not those of methyl's kind."""
+        graph, ends, sides = bonded_graph(scene), [], []
+        for quad in rotatable_torsions(scene, rotors=True).tolist():
+            for last, fixed in (quad[1:3], quad[2:0:-1]):
+                side = beyond(graph, fixed, last)
+                if 2 * len(side) <= scene.n_atoms:
+                    break
+            if not (len(side) == len(graph[last]) == 4 and len({scene.elements[i] for i in side - {last}}) == 1):
+                ends.append((fixed, last))
+                sides.append([i in side for i in range(scene.n_atoms)])
+        return Turns(torch.tensor(ends).reshape(-1, 2), torch.tensor(sides).reshape(-1, scene.n_atoms))
+
+    def to(self, device: torch.device) -> Turns:
+        return Turns(*(tensor.to(device) for tensor in self))
+
+    def turned(self, x_nm: Tensor, v: Tensor, which: Tensor, angle: Tensor) -> tuple[Tensor, Tensor]:
+        """Return frames and velocities `(rows, n_atoms, 3)`, each turned about bond `which` (rows,) by `angle` (rows,),
+        radian: rigid parts stay rigid, and move on as they did."""
+        rows = torch.arange(len(x_nm))
+        first, second = (x_nm[rows, self.ends[which, k]][:, None] for k in (0, 1))
+        axis = torch.nn.functional.normalize(second - first, dim=-1).expand_as(x_nm)
+        cos, sin, side = angle.cos()[:, None, None], angle.sin()[:, None, None], self.side[which][..., None]
+
+        def turn(arm: Tensor) -> Tensor:
+            along = (arm * axis).sum(-1, keepdim=True) * axis
+            return cos * (arm - along) + sin * torch.linalg.cross(axis, arm) + along
+
+        return torch.where(side, second + turn(x_nm - second), x_nm), torch.where(side, turn(v), v)
+
+
+class Own(NamedTuple):
+    """What the MD of a molecule needs beside its atoms: `rigid` bonds and bonds that torsion moves turn, if any."""
+
+    rigid: RigidBonds | None
+    turns: Turns | None
+
+    def to(self, device: torch.device) -> Own:
+        return Own(*(part if part is None else part.to(device) for part in self))
+
+
 class Potential(Propagator):
     """Energies and forces: a learned potential, which is a propagator by the MD that is run on it.
 
     A subclass sets `arch` and `config` (an `IntegratorConfig` or what extends it) and implements `energies`, a
     differentiable function of positions; forces are its exact gradient. Masses, rigid bonds to hydrogen, thermostat and
     chunks are here: Langevin middle (Zhang 2019) or velocity Verlet, in double precision, with the centre of mass at
-    rest. It may override `gradient` where it has a faster one than torch's, and `featurise`, whose `own` is then a
-    `RigidBonds` or None.
+    rest. It may override `gradient` where it has a faster one than torch's, and `featurise`, whose `own` is then an
+    `Own` or None.
 
     Beside what holds for every propagator (`surrogate.models.conformance`), the energy does not depend on where the
     molecule lies, how it is turned and what is evaluated beside it, and is finite and smooth wherever MD may lead it.
@@ -138,14 +192,15 @@ class Potential(Propagator):
         return model
 
     def featurise(self, scene: Scene) -> Molecule:
-        """See `Propagator.featurise`; `own`: bonds to hydrogen, as long as at the nearest minimum of the energy; None
-        where they are flexible."""
-        molecule = Molecule.of(scene)
+        """See `Propagator.featurise`; bonds to hydrogen are as long as at the nearest minimum of the energy, and not
+        rigid at short steps."""
+        molecule, rigid = Molecule.of(scene), None
         bonds = [pair for pair in molecule.bonds.tolist() if any(molecule.elements[i] == _HYDROGEN for i in pair)]
-        if not (self.config.constrain_hydrogens and bonds):
-            return molecule
-        rest_nm = self._minimum_nm(torch.tensor(scene.positions_nm, dtype=torch.float64), molecule)
-        return replace(molecule, own=RigidBonds.of(rest_nm, torch.tensor(bonds), self.masses_da(molecule)))
+        if self.config.constrain_hydrogens and bonds:
+            rest_nm = self._minimum_nm(torch.tensor(scene.positions_nm, dtype=torch.float64), molecule)
+            rigid = RigidBonds.of(rest_nm, torch.tensor(bonds), self.masses_da(molecule))
+        turns = Turns.of(scene) if self.config.torsion_moves else None
+        return replace(molecule, own=Own(rigid, turns if turns is not None and len(turns.ends) else None))
 
     def _minimum_nm(self, positions_nm: Tensor, molecule: Molecule) -> Tensor:
         with torch.inference_mode(False), torch.enable_grad():
@@ -162,8 +217,9 @@ class Potential(Propagator):
             return x.detach()
 
     def noise_shape(self, n_atoms: int) -> tuple[int, ...]:
-        """One vector an atom for the first velocities, then for each step."""
-        return (n_atoms, 1 + self.n_new * self.steps_per_frame, 3)
+        """One vector an atom for the first velocities, then for each step; before a frame's steps those of its torsion
+        moves."""
+        return (n_atoms, 1 + self.n_new * (self.config.torsion_moves + self.steps_per_frame), 3)
 
     def masses_da(self, molecule: Molecule) -> Tensor:
         """Masses `(n_atoms,)` that move: hydrogens as heavy as the settings have them, at the cost of their bond's
@@ -190,11 +246,31 @@ class Potential(Propagator):
             v = drawn if last_velocities_nm_ps is None else last_velocities_nm_ps.clone().double()
             frames = []
             move = self.verlet if self.config.ensemble == "nve" else self.langevin
-            for draw in draws[:, :, 1:].split(self.steps_per_frame, dim=2):
+            for of_frame in draws[:, :, 1:].chunk(self.n_new, dim=2):
+                turning, draw = of_frame.tensor_split([self.config.torsion_moves], dim=2)
+                if molecule.own is not None and molecule.own.turns is not None:
+                    x, v = self._turned(x, v, molecule, masses, turning[:, 0])
                 x, v = move(x, v, molecule, masses, thermal, draw)
                 frames.append(x)
             found = torch.stack(frames, dim=1).to(last_frames_nm.dtype)
             return Chunk(found, v.to(found.dtype), float(draws.shape[2] - 1))
+
+    def _turned(self, x: Tensor, v: Tensor, molecule: Molecule, masses: Tensor, draw: Tensor) -> tuple[Tensor, Tensor]:
+        """Return positions and velocities `(rows, n_atoms, 3)` after moves of Metropolis et al., J. Chem. Phys. 21,
+        1087 (1953), which leave the Boltzmann distribution as it is: what is beyond one bond turns by any angle, its
+        velocities with it, and stays so with the probability exp(-dU / kT). `draw` (rows, n_moves, 3): normal numbers.
+        """
+        turns, energies, before = molecule.own.turns, self.gradient(x, molecule), x
+        now = energies(x)[0].mean(-1)
+        for which, angle, chance in torch.special.ndtr(draw).permute(1, 2, 0):
+            bond = (which * len(turns.ends)).long().clamp(max=len(turns.ends) - 1)
+            there, moving = turns.turned(x, v, bond, 2.0 * math.pi * angle)
+            then = energies(there)[0].mean(-1)
+            taken = chance.log() * GAS_CONSTANT_KJ_MOL_K * self.config.temperature_k < now - then
+            x, v = (torch.where(taken[:, None, None], a, b) for a, b in ((there, x), (moving, v)))
+            now = torch.where(taken, then, now)
+        # The centre of mass stays where it was.
+        return x + (masses / masses.sum() * (before - x)).sum(1, keepdim=True), v
 
     def bath(self, molecule: Molecule, masses: Tensor, thermal: Tensor, timestep_ps: float | None = None) -> Bath:
         """Return the bath of the settings; `thermal`: see `langevin`."""
@@ -238,7 +314,7 @@ class Potential(Propagator):
 
     @staticmethod
     def _rigid(molecule: Molecule, timestep_ps: float) -> RigidBonds | None:
-        return molecule.own if timestep_ps > LONGEST_FLEXIBLE_PS else None
+        return molecule.own.rigid if molecule.own is not None and timestep_ps > LONGEST_FLEXIBLE_PS else None
 
 
 def at_rest(v: Tensor, masses: Tensor) -> Tensor:

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import copy
 import hashlib
+import math
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -41,6 +42,8 @@ _Model = TypeVar("_Model", bound=Propagator)
 # Up to as many replicas one thread was faster than two, on a pair of hardware threads: products of few rows are too
 # small to be shared.
 _ROWS_OF_ONE_THREAD = 16
+# At 4 fs most replicas of suprofen and lidocaine fly apart within 20 ps at 600 K; of 2.5 fs none does.
+_HOT_STEP_PS = 0.0025
 
 
 class Drawn(NamedTuple):
@@ -84,11 +87,15 @@ class ChunkSampler:
         self._target = template.positions_nm - template.positions_nm[self._fit].mean(axis=0)
 
     def at(self, temperature_k: float, n_new: int) -> ChunkSampler:
-        """Return this sampler of a potential at another temperature, in NVT, for chunks of `n_new` frames."""
-        other = copy.copy(self)
+        """Return this sampler of a potential at another temperature, in NVT, for chunks of `n_new` frames; in steps
+        that are stable at 600 K."""
+        other, model = copy.copy(self), cast(Potential, self._model)
         other.n_new = n_new
-        bath = {"temperature_k": temperature_k, "ensemble": "nvt", "n_new": n_new}
-        other._model = cast(Potential, self._model).in_bath(bath)
+        step_ps, lag_ps = model.config.timestep_ps, model.config.lag_ps
+        if step_ps > _HOT_STEP_PS:
+            step_ps = lag_ps / math.ceil(lag_ps / _HOT_STEP_PS - 1e-6)
+        bath = {"temperature_k": temperature_k, "ensemble": "nvt", "n_new": n_new, "timestep_ps": step_ps}
+        other._model = model.in_bath(bath)
         return other
 
     @property
@@ -224,11 +231,13 @@ class Guard:
             missing = ("stillness: the weights carry no limit of it",)
         return (*self._geometry.excluded, *missing)
 
-    def check(self, frames_nm: FloatArray, before_nm: FloatArray, *, from_start: bool = False) -> Flags:
+    def check(
+        self, frames_nm: FloatArray, before_nm: FloatArray, *, from_start: bool = False, may_jump: bool = False
+    ) -> Flags:
         """Return the flags `(b, n)` of frames `(b, n, n_atoms, 3)` nm that follow `before_nm (b, n_atoms, 3)`.
 
         `from_start`: the frames before are the user's structure, which need not be one of the ensemble, so that the
-        first step away from it does not count as a jump.
+        first step away from it does not count as a jump; `may_jump`: none does.
         """
         n_rows, n_frames = frames_nm.shape[:2]
         flat = frames_nm.reshape(-1, *frames_nm.shape[2:])
@@ -236,8 +245,8 @@ class Guard:
         if self._limits is not None:
             previous = np.concatenate([before_nm[:, None], frames_nm[:, :-1]], axis=1).reshape(flat.shape)
             found = validity.check_limits(flat, self._limits, previous).reshape(n_rows, n_frames)
-            if from_start:
-                found[:, 0] &= ~np.uint16(validity.JUMP | validity.DRIFT)
+            if from_start or may_jump:
+                found[:, : n_frames if may_jump else 1] &= ~np.uint16(validity.JUMP | validity.DRIFT)
             flags |= found.reshape(-1)
         return flags.reshape(n_rows, n_frames)
 
@@ -543,7 +552,9 @@ class Interventions:
     def _check(self, rows: npt.NDArray[np.int64]) -> None:
         with timed(self.state.seconds, "check"):
             frames, before = self.chunk.frames_nm[rows], self.state.last_frames[rows, -1]
-            flags = self.checks.check(frames, before, from_start=self.state.steps == 0)
+            flags = self.checks.check(
+                frames, before, from_start=self.state.steps == 0, may_jump=self.config.torsion_moves > 0
+            )
             if self.potential is not None:
                 flags |= np.uint16(validity.UNSURE) * self.potential.unsure(frames)
             self.chunk.flags[rows] = flags

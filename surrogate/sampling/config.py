@@ -59,6 +59,11 @@ class RolloutConfig:
     anneal_ps: float = option(
         "Length of MD at 600 K that replicas start from after cooling (learned potentials).", 0.0, within=(0.0, None)
     )
+    torsion_moves: int = option(
+        "Monte Carlo moves of torsions per frame (learned potentials); populations as before, but no kinetics.",
+        0,
+        within=(0, 100),
+    )
     solver: str | None = option(
         "ODE solver: multistep, fitted (few steps), gaussian, angular (peptides), euler, dopri5.",
         None,
@@ -80,4 +85,5 @@ class RolloutConfig:
     def bath(self) -> dict[str, Any]:
         """What is asked for of the integration, by the names of a potential's settings."""
         names = ("temperature_k", "friction_per_ps", "timestep_ps", "hydrogen_mass_da", "ensemble")
-        return {name: getattr(self, name) for name in names if getattr(self, name) is not None}
+        given = {name: getattr(self, name) for name in names if getattr(self, name) is not None}
+        return given | ({"torsion_moves": self.torsion_moves} if self.torsion_moves else {})

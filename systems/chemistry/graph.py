@@ -361,13 +361,18 @@ def exclusions(scene: Scene, depth: int = 3) -> IntArray:
     return np.array(sorted(rows), dtype=np.int64).reshape(-1, 2)
 
 
+def beyond(graph: nx.Graph, b: int, c: int) -> set[int]:
+    """Return the atoms on the side of `c` of a bond to `b` in no ring, `c` among them."""
+    cut = graph.copy()
+    cut.remove_edge(b, c)
+    return set(nx.node_connected_component(cut, c))
+
+
 def turned(positions_nm: FloatArray, quad: Sequence[int], angle: float, graph: nx.Graph) -> FloatArray:
     """Return positions `(n_atoms, 3)` with what hangs beyond a torsion's middle bond turned about it, so that the
     torsion grows by `angle` (radian). `graph`: `bonded_graph`, which the bond must hold together."""
     _, b, c, _ = (int(k) for k in quad)
-    cut = graph.copy()
-    cut.remove_edge(b, c)
-    side = sorted(nx.node_connected_component(cut, c))
+    side = sorted(beyond(graph, b, c))
     axis = (positions_nm[c] - positions_nm[b]) / np.linalg.norm(positions_nm[c] - positions_nm[b])
     arm = positions_nm[side] - positions_nm[c]
     out = positions_nm.copy()

@@ -22,7 +22,7 @@ from surrogate.models.painet.energy import (
     latent_energy,
     simd_potential_of,
 )
-from surrogate.models.potential import RigidBonds
+from surrogate.models.potential import Own, RigidBonds
 from surrogate.models.propagator import Molecule, Propagator
 from systems.errors import InputError
 
@@ -133,7 +133,7 @@ def test_steps_by_simd_are_those_of_torch(timestep_ps: float, rows: int, monkeyp
     bare = Molecule(elements, torch.where(elements == 1, 1.008, 14.0), bonds)
     masses = lively(config).masses_da(bare)
     rigid = RigidBonds.of(x[0], bonds[2:], masses)
-    molecule = Molecule(elements, bare.masses_da, bonds, own=rigid)
+    molecule = Molecule(elements, bare.masses_da, bonds, own=Own(rigid, None))
     is_rigid = timestep_ps > 0.002
     x = rigid.place(x, x) if is_rigid else x
     # A bath of its own for each.

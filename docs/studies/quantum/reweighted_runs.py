@@ -7,7 +7,9 @@
 by its own weights, too), on the cores it may use; nothing else should run (`taskset -c 1` for one core). `table` takes
 cos and sin of every torsion that turns, folded by its symmetry, as observables f. A run states the mean of each at
 GFN2-xTB's law with an error s (jackknife over its replicas); MD of length T would know it to sqrt(2 tau Var f / T),
-with tau the integrated correlation time of f in the rollout, which moves as MD does. So a run is worth
+with tau the integrated correlation time of f in a rollout without torsion moves (16 replicas of 100 ps, annealed first,
+which `runs` makes, too): that moves as MD does, and what turns more slowly counts as if it took no longer than that
+rollout shows. So a run is worth
 T = 2 tau Var f / s^2 of MD that has forgotten its start; the speed-up is that over what MD by GFN2-xTB, a replica a
 core, makes in the whole budget. `z`: root mean square difference of the two runs over their errors, 1 where errors are
 right.
@@ -18,7 +20,9 @@ from __future__ import annotations
 import argparse
 import json
 import sys
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -31,6 +35,7 @@ from surrogate.comparison.measure.torsions import find_torsions
 from surrogate.comparison.read.ensemble import load_ensemble
 from surrogate.verbs.run.run_record import RUN_NAME, RunResult
 from systems.chemistry.geometry import torsion_angle
+from systems.files.whole_file import replica_paths
 
 FloatArray = npt.NDArray[np.float64]
 GENERAL = "drug-like-gfn2-xtb"
@@ -45,16 +50,32 @@ MOLECULES = {
     "lidocaine": ("smiles:CCN(CC)CC(=O)Nc1c(C)cccc1C", GENERAL),
 }
 SEEDS = (0, 1)
+# The rollout without torsion moves.
+PLAIN: dict[str, Any] = {
+    "time_ps": 100.0,
+    "save_every_ps": 0.5,
+    "replicas": 16,
+    "anneal_ps": 20.0,
+    "guard": "resample",
+    "seed": 2,
+}
 # Two runs so many of their errors apart have errors that are too small: such a molecule counts as no speed-up.
 LARGEST_Z = 3.0
 
 
+def place(folder: Path, name: str, which: int | str) -> Path:
+    return folder / f"{name.replace(', ', '_').replace(' ', '_')}_{which}"
+
+
 def make_runs(folder: Path, names: list[str], minutes: float) -> None:
     """Run every molecule with both seeds; what is done is left alone, what was stopped goes on."""
+    for name in names:
+        source, weights = MOLECULES[name]
+        sm.rollout(source, weights, place(folder, name, "plain.h5"), **PLAIN, resume=True, quiet=True)
     for seed in SEEDS:
         for name in names:
             source, weights = MOLECULES[name]
-            out = folder / f"{name.replace(', ', '_').replace(' ', '_')}_{seed}"
+            out = place(folder, name, seed)
             is_there = (out / RUN_NAME).is_file()
             if not (is_there and RunResult.of(out)["outcome"]):
                 sm.run(source, out, level="gfn2-xtb", weights=weights, budget_s=60.0 * minutes, seed=seed, quiet=True,
@@ -62,18 +83,24 @@ def make_runs(folder: Path, names: list[str], minutes: float) -> None:
             said(f"{name}, seed {seed}: {RunResult.of(out).headline}")
 
 
-class Run:
-    """One run: observables `(replicas, frames, k)` of its rollout, weights `(replicas, frames)` at GFN2-xTB's law."""
+def observables(paths: Sequence[str | Path]) -> tuple[FloatArray, float]:
+    """Return cos and sin of torsions that turn, folded, `(replicas, frames, k)`, and the frames' spacing in ps."""
+    rolled = load_ensemble(paths)
+    torsions = [t for t in find_torsions(rolled.scene) if t.kind in SLOW_KINDS]
+    quads, fold = np.array([t.quad for t in torsions]), np.array([t.fold for t in torsions])
+    n = min(rolled.segment_lengths)
+    angles = [fold * torsion_angle(np.asarray(s[:n]).transpose(2, 1, 0), quads).T for s in rolled.segments]
+    return np.array([np.concatenate([np.cos(a), np.sin(a)], axis=1) for a in angles]), rolled.lag_ps
 
-    def __init__(self, folder: Path) -> None:
-        self.result = RunResult.of(folder)
-        rolled = load_ensemble(self.result.trajectory)
-        torsions = [t for t in find_torsions(rolled.scene) if t.kind in SLOW_KINDS]
-        quads, fold = np.array([t.quad for t in torsions]), np.array([t.fold for t in torsions])
-        n = min(rolled.segment_lengths)
-        angles = [fold * torsion_angle(np.asarray(s[:n]).transpose(2, 1, 0), quads).T for s in rolled.segments]
-        self.lag_ps = rolled.lag_ps
-        self.f = np.array([np.concatenate([np.cos(a), np.sin(a)], axis=1) for a in angles])
+
+class Run:
+    """One run: observables `(replicas, frames, k)` of its rollout, weights `(replicas, frames)` at GFN2-xTB's law;
+    `tau_ps` (k,) of MD."""
+
+    def __init__(self, folder: Path, tau_ps: FloatArray) -> None:
+        self.result, self.tau_ps = RunResult.of(folder), tau_ps
+        self.f, _ = observables(self.result.trajectory)
+        n = self.f.shape[1]
         self.w = np.array([sm.frame_weights(path)[:n] for path in self.result.trajectory])
         self.asked, self.effective = self.result.answer["energies"]
         # As in the answer: frames that were asked, weighted, less what these are off by without weights.
@@ -95,8 +122,7 @@ class Run:
 
     def worth_ps(self) -> FloatArray:
         """Return of how much MD each observable is worth."""
-        tau_ps = [self.lag_ps * zero_crossing(list(self.f[:, :, k]))[1] for k in range(self.f.shape[2])]
-        return np.asarray(2.0 * np.array(tau_ps) * self.variance / np.square(self.error))
+        return np.asarray(2.0 * self.tau_ps * self.variance / np.square(self.error))
 
     @property
     def md_ps(self) -> float:
@@ -126,9 +152,11 @@ def line(name: str, runs: list[Run]) -> tuple[list[str], float]:
 def make_table(folder: Path, out: Path | None) -> None:
     rows, gains = [], {}
     for name in MOLECULES:
-        places = [folder / f"{name.replace(', ', '_').replace(' ', '_')}_{seed}" for seed in SEEDS]
+        places = [place(folder, name, seed) for seed in SEEDS]
         if all((p / RUN_NAME).is_file() and RunResult.of(p)["outcome"] for p in places):
-            cells, gains[name] = line(name, [Run(p) for p in places])
+            f, lag_ps = observables(replica_paths(place(folder, name, "plain.h5"), PLAIN["replicas"]))
+            tau_ps = lag_ps * np.array([zero_crossing(list(f[:, :, k]))[1] for k in range(f.shape[2])])
+            cells, gains[name] = line(name, [Run(p, tau_ps) for p in places])
             rows.append(cells)
             said(" | ".join(cells))
     unseen = [gain for name, gain in gains.items() if not name.startswith("paracetamol")]

@@ -25,7 +25,7 @@ class Plan(NamedTuple):
 
 # A rollout's frames are reweighted by energies of an expensive reference, one of which costs as much as a step of MD.
 # Some time goes into MD where that comes to so many ps; below it would tell nothing.
-_REWEIGHTED: dict[Stage, float] = {"rollout": 0.8, "energies": 0.2}
+_REWEIGHTED: dict[Stage, float] = {"rollout": 0.7, "energies": 0.3}
 _MD_BESIDE, _LEAST_MD_PS = 0.3, 50.0
 # MD without a surrogate is compared with itself: it is split by replicas, or by stages if there is one replica.
 PLANS: dict[Way, Plan] = {

@@ -47,7 +47,9 @@ _LEAST_FRAMES = 20
 # Of MD from frames of a rollout is left out so much: what is local has forgotten the model by then.
 _LEFT_OUT_PS = 20.0
 # Of a potential's rollout goes into annealing, at most: what turns once in a ns would keep the state it was built in.
-_ANNEAL_PS, _ANNEAL = 50.0, 0.2
+_ANNEAL_PS, _ANNEAL = 50.0, 0.1
+# In each of its frames, 0.1 ps: what MD turns once in 20 ps these turn in one, at a sixth of a step each.
+_TORSION_MOVES = 3
 # Of MD's time goes into relaxing frames of a rollout to begin at; in less, fewer replicas begin apart, but so many.
 _STARTING, _LEAST_STARTS = 0.15, 4
 # Runs of one scene whose seeds differ by this are independent, replicas and all.
@@ -247,6 +249,7 @@ def _roll(site: Site, record: RunRecord) -> RunRecord:
             seed=site.options.seed,
             replicas=rates.rolls.replicas,
             anneal_ps=min(_ANNEAL_PS, _ANNEAL * expected_ps) if rates.expensive else 0.0,
+            torsion_moves=_TORSION_MOVES if rates.expensive else 0,
             # Of a potential only the reference could mend frames; a replica that flies apart must not end the others.
             guard="resample" if rates.expensive else "repair",
             resume=True,

@@ -31,7 +31,7 @@ def compare(*args: Any, **kwargs: Any) -> Comparison:
     return compare_with_everything(*args, options=Options(peptide_recipe=False), **kwargs)
 
 
-def evaluate(inputs: ComparisonInput, frames: np.ndarray, **changes: float) -> Evaluation:
+def evaluate(inputs: ComparisonInput, frames: np.ndarray, **changes: Any) -> Evaluation:
     """Evaluate the input's candidate with other frames (and, say, another lag) in its place."""
     reference, candidate, replicate = inputs
     wrong = replace(candidate, segments=[frames.astype(np.float32)], **changes)
@@ -71,6 +71,22 @@ def test_shuffled_frames_lose_their_kinetics_and_nothing_else(inputs: Comparison
         assert found.row(key).candidate.value == pytest.approx(fair.row(key).candidate.value, abs=1e-12)
         assert found.row(key).verdict == "agrees"
     assert "relaxation time of cos ψ" in found.verdict
+
+
+def test_kinetics_of_turned_torsions_are_not_compared(inputs: ComparisonInput) -> None:
+    """Of a rollout with torsion moves, or against one: its frames are a sample, whose order tells nothing."""
+    reference, candidate, replicate = inputs
+    frames = frames_of(inputs)
+    np.random.default_rng(0).shuffle(frames)
+    turned = {"torsion_moves": 2}
+    found = evaluate(inputs, frames, record={**candidate.record, **turned})
+    assert found.status == "indistinguishable", found.verdict
+    assert {r.group for r in found.rows} == {r.group for r in evaluate(inputs, frames).rows} - {"kinetics"}
+    assert ("Kinetics", "torsions were turned by Monte Carlo moves") in found.skipped
+    assert all(each.kind != "kinetics" for each in found.equivalent_time)
+    known = replace(reference, record={**reference.record, **turned})
+    against = compare(known, [candidate], replicate).evaluations[0]
+    assert "kinetics" not in {r.group for r in against.rows}
 
 
 def test_mirror_image_inverts_the_stereocentre(inputs: ComparisonInput) -> None:

@@ -130,7 +130,10 @@ def test_annealed_replicas_start_all_over(tmp_path: Path, monkeypatch: pytest.Mo
     def at_asked(self: Any, temperature_k: float, n_new: int) -> Any:
         asked.append(temperature_k)
         frames.append(n_new)
-        return at(self, temperature_k, n_new)
+        found = at(self, temperature_k, n_new)
+        # 4 fs is too long where it is hot.
+        assert found._model.config.timestep_ps == pytest.approx(0.0025) and self._model.config.timestep_ps == 0.004
+        return found
 
     monkeypatch.setattr(runner.ChunkSampler, "at", at_asked)
     still = rolled("still", 0.0)

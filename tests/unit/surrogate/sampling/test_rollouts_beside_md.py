@@ -107,8 +107,12 @@ def test_settings_that_cannot_be_are_refused(domain: TrainingDomain) -> None:
     )
 
 
-def test_energies_are_compared_for_learned_potentials_alone(
-    tmp_path: Path, scene: Scene, domain: TrainingDomain
+@pytest.mark.parametrize(
+    ("name", "match"),
+    [("energy_every", "`energy_every` is for learned potentials"), ("torsion_moves", "leave `torsion_moves` out")],
+)
+def test_energies_are_for_learned_potentials_alone(
+    tmp_path: Path, scene: Scene, domain: TrainingDomain, name: str, match: str
 ) -> None:
-    with pytest.raises(InputError, match="`energy_every` is for learned potentials"):
-        roll(tmp_path / "a.h5", scene, weights_of(domain), "flag", energy_every=3)
+    with pytest.raises(InputError, match=match):
+        roll(tmp_path / "a.h5", scene, weights_of(domain), "flag", **{name: 3})
