@@ -131,7 +131,7 @@ class Own(NamedTuple):
     turns: Turns | None
 
     def to(self, device: torch.device) -> Own:
-        return Own(*(part if part is None else part.to(device) for part in self))
+        return Own(self.rigid and self.rigid.to(device), self.turns and self.turns.to(device))
 
 
 class Potential(Propagator):
