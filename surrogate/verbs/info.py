@@ -118,11 +118,13 @@ def _trajectory(path: Path) -> dict[str, Any]:
 
 
 def rollout_lines(record: dict[str, Any]) -> list[str]:
-    """Return how a rollout's molecule differs from what its weights were trained on, and in which precision its network
-    was evaluated, and why; nothing of other files."""
+    """Return how a rollout's molecule differs from what its weights were trained on, whether its frames follow each
+    other, and in which precision its network was evaluated, and why; nothing of other files."""
     lines = [UNSEEN] if record.get("unseen_molecule") else []
     beyond = record.get("out_of_domain") or []
     lines += [f"outside the training domain (`force=True`): {d['what']}: {d['reason']}" for d in beyond]
+    if moves := record.get("torsion_moves"):
+        lines.append(f"torsions turned by Monte Carlo, {moves} moves a frame: a sample of states, without kinetics")
     reason = record.get("precision_reason")
     return lines if reason is None else [*lines, f"network in {record.get('precision')}: {reason}"]
 

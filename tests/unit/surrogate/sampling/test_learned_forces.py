@@ -21,6 +21,7 @@ from surrogate.sampling import runner
 from surrogate.sampling.domain import in_bath
 from surrogate.sampling.runner import RolloutConfig, rollout
 from surrogate.sampling.simulation import KJ_MOL_PER_EV, LearnedForces
+from surrogate.verbs.info import rollout_lines
 from systems.chemistry.graph import match_atoms
 from systems.chemistry.validity import ENERGY, UNSURE, geometry_from_frames
 from systems.errors import InputError, OutOfDomainError, SurromdError
@@ -161,6 +162,29 @@ def test_annealed_replicas_start_all_over(tmp_path: Path, monkeypatch: pytest.Mo
     other = weights(Painet(PainetConfig(n_new=2, width=16)))
     with pytest.raises(InputError, match="learned potentials"):
         rollout(other.domain.scene, other, [tmp_path / "x.h5"], RolloutConfig(time_ps=0.1, anneal_ps=1.0))
+
+
+def test_torsion_moves_turn_what_md_does_not_and_no_frame_is_caught_for_it(tmp_path: Path) -> None:
+    loaded = load_weights(weights_path("paracetamol-gfn2-xtb"))
+    scene, hydroxyl = loaded.domain.scene, [5, 7, 8, 17]
+    assert [scene.elements[i] for i in hydroxyl] == ["C", "C", "O", "H"]
+
+    def rolled(name: str, moves: int) -> tuple[Any, list[Any]]:
+        outs = [tmp_path / f"{name}_r{k}.h5" for k in range(8)]
+        config = RolloutConfig(time_ps=1.0, guard="flag", torsion_moves=moves)
+        readers = [open_trajectory(out) for out in rollout(scene, loaded, outs, config)]
+        run = mdtraj.Trajectory(np.concatenate([r.read() for r in readers]), scene.to_mdtraj_topology())
+        cosines = np.cos(mdtraj.compute_dihedrals(run, [hydroxyl])).reshape(8, -1)
+        assert not any(r.flags.any() for r in readers)
+        return cosines, [r.record for r in readers]
+
+    still, (record, *_) = rolled("still", 0)
+    assert (np.sign(still) == np.sign(still[0, 0])).all() and not any("Monte Carlo" in x for x in rollout_lines(record))
+    turned, (record, *_) = rolled("turned", 5)
+    assert (np.abs(np.diff(np.sign(turned), axis=1)) > 0).any(axis=1).sum() >= 4
+    assert "torsions turned by Monte Carlo, 5 moves a frame: a sample of states, without kinetics" in rollout_lines(
+        record
+    )
 
 
 def test_models_of_frames_take_no_other_bath() -> None:

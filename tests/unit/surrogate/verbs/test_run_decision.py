@@ -135,7 +135,9 @@ def test_where_forces_are_expensive_energies_of_frames_take_the_place_of_md_that
     covered = replace(EXPENSIVE, rolls=Rolls("drug-like-gfn2-xtb", 0.1, 100.0, 32))
     found = decide(covered, 60.0)
     assert found.way == "rollout" and named(found) == ["rollout", "energies", "report"]
-    assert found.seconds("rollout") == pytest.approx(7.0 / 3.0 * found.seconds("energies")) and found.equilibrate_ps == 0.0
+    assert (
+        found.seconds("rollout") == pytest.approx(7.0 / 3.0 * found.seconds("energies")) and found.equilibrate_ps == 0.0
+    )
     assert "reference's energies weigh" in table(covered, found, 60.0)["way"]
     slow = replace(covered, rolls=Rolls("drug-like-gfn2-xtb", 0.1, 10.0, 32))
     assert decide(slow, 600.0).seconds("report") < 0.5 * decide(COVERED, 600.0).seconds("report"), "few frames to read"
