@@ -94,14 +94,17 @@ class Turns(NamedTuple):
 
     @staticmethod
     def of(scene: Scene) -> Turns:
-        """Return a molecule's rotatable bonds, hydroxyl's and the like among them, but not those of methyl's kind."""
+        """Return a molecule's rotatable bonds, hydroxyl's and the like among them, but not those of methyl's kind, nor
+        of unknown order, which may be double."""
         graph, ends, sides = bonded_graph(scene), [], []
         for quad in rotatable_torsions(scene, rotors=True).tolist():
             for last, fixed in (quad[1:3], quad[2:0:-1]):
                 side = beyond(graph, fixed, last)
                 if 2 * len(side) <= scene.n_atoms:
                     break
-            if not (len(side) == len(graph[last]) == 4 and len({scene.elements[i] for i in side - {last}}) == 1):
+            if graph.edges[fixed, last]["order"] and not (
+                len(side) == len(graph[last]) == 4 and len({scene.elements[i] for i in side - {last}}) == 1
+            ):
                 ends.append((fixed, last))
                 sides.append([i in side for i in range(scene.n_atoms)])
         return Turns(torch.tensor(ends).reshape(-1, 2), torch.tensor(sides).reshape(-1, scene.n_atoms))
