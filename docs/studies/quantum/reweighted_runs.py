@@ -9,10 +9,9 @@ cos and sin of every torsion that turns, folded by its symmetry, as observables 
 GFN2-xTB's law with an error s (jackknife over its replicas); MD of length T would know it to sqrt(2 tau Var f / T),
 with tau the integrated correlation time of f in a rollout without torsion moves (16 replicas of 100 ps, annealed first,
 which `runs` makes, too): that moves as MD does, and what turns more slowly counts as if it took no longer than that
-rollout shows. So a run is worth
-T = 2 tau Var f / s^2 of MD that has forgotten its start; the speed-up is that over what MD by GFN2-xTB, a replica a
-core, makes in the whole budget. `z`: root mean square difference of the two runs over their errors, 1 where errors are
-right.
+rollout shows. So a run is worth T = 2 tau Var f / s^2 of MD that has forgotten its start; the speed-up is that over
+what MD by GFN2-xTB, a replica a core, makes in the whole budget, at the faster of the speeds that both runs measured.
+`z`: root mean square difference of the two runs over their errors, 1 where errors are right.
 """
 
 from __future__ import annotations
@@ -132,17 +131,18 @@ class Run:
 
 def line(name: str, runs: list[Run]) -> tuple[list[str], float]:
     """Return the cells of a molecule, and its speed-up: the mean of both runs' medians over observables."""
+    md_ps = max(r.md_ps for r in runs)
     # What does not vary (sin of a mirror image) is no observable.
     varies = np.all([r.variance > 1e-3 for r in runs], axis=0)
-    worth = [np.median((r.worth_ps() / r.md_ps)[varies]) for r in runs]
-    least = [np.min((r.worth_ps() / r.md_ps)[varies]) for r in runs]
+    worth = [np.median((r.worth_ps() / md_ps)[varies]) for r in runs]
+    least = [np.min((r.worth_ps() / md_ps)[varies]) for r in runs]
     a, b = runs
     z = float(np.sqrt(np.mean(np.square((a.mean - b.mean)[varies]) / (a.error**2 + b.error**2)[varies])))
     worth = worth if z < LARGEST_Z else [0.0, 0.0]
     shares = ", ".join(f"{r.effective / r.asked:.0%} of {r.asked}" for r in runs)
     rolled = float(np.mean([r["rolled_ps"] for r in (x.result["outcome"] for x in runs)])) * 2e-3
     return [
-        name, str(a.result["rates"]["n_atoms"]), f"{rolled:.2g}", f"{np.mean([r.md_ps for r in runs]):.0f}", shares,
+        name, str(a.result["rates"]["n_atoms"]), f"{rolled:.2g}", f"{md_ps:.0f}", shares,
         f"{max(np.max(r.error[varies]) for r in runs):.2g}", f"{z:.2g}",
         f"{np.mean(worth):.2g} ({', '.join(f'{w:.2g}' for w in worth)})" if any(worth) else "none: runs disagree",
         f"{np.mean(least):.2g}",

@@ -51,7 +51,6 @@ from md_reference.run.labeller import Labeller
 from surrogate.models.painet.energy import (
     LEAST_NM,
     N_SHELLS,
-    NO_WALL_NM,
     WALL,
     Edges,
     EnergyNetwork,
@@ -328,17 +327,8 @@ def errors_of(model: PainetPotential, one: Labelled, most: int = 24) -> tuple[fl
 
 def set_walls(model: PainetPotential, learned: list[Labelled]) -> None:
     """Stand walls beyond the distances of all molecules together."""
-    network = model.network
-    nearest = torch.full_like(network.nearest_nm, NO_WALL_NM)
-    farthest = torch.zeros_like(network.farthest_nm)
-    for one in learned:
-        network.set_walls(one.positions_nm, one.topology)
-        seen = network.nearest_nm > 0
-        nearest[seen] = torch.minimum(nearest, network.nearest_nm)[seen]
-        bound = network.farthest_nm < NO_WALL_NM
-        farthest[bound] = torch.maximum(farthest, network.farthest_nm)[bound]
-    network.nearest_nm.copy_(torch.where(nearest < NO_WALL_NM, nearest, 0.0))
-    network.farthest_nm.copy_(torch.where(farthest > 0, farthest, NO_WALL_NM))
+    for k, one in enumerate(learned):
+        model.network.set_walls(one.positions_nm, one.topology, widen=k > 0)
 
 
 def train(given: argparse.Namespace) -> None:

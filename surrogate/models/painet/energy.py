@@ -337,12 +337,14 @@ class EnergyNetwork(nn.Module):
         self.nearest_nm = nn.Buffer(torch.zeros(N_SHELLS, N_TYPES, N_TYPES))
         self.farthest_nm = nn.Buffer(torch.full((N_SHELLS, N_TYPES, N_TYPES), NO_WALL_NM))
 
-    def set_walls(self, positions_nm: Tensor, topology: Topology) -> None:
+    def set_walls(self, positions_nm: Tensor, topology: Topology, *, widen: bool = False) -> None:
         """Stand walls a little beyond the distances of samples `(n, n_atoms, 3)` nm: the shortest of all pairs of like
-        types and as many bonds apart, the longest of those one or two bonds apart."""
+        types and as many bonds apart, the longest of those one or two bonds apart; `widen`: and no nearer to what is
+        known than they stood."""
         elements = topology.molecule.elements
-        self.nearest_nm.zero_()
-        self.farthest_nm.fill_(NO_WALL_NM)
+        if not widen:
+            self.nearest_nm.zero_()
+            self.farthest_nm.fill_(NO_WALL_NM)
         extremes: dict[tuple[int, int, int], tuple[float, float]] = {}
         for (i, j), shell in (_all_pairs(len(elements)) | topology.shells).items():
             distance = (positions_nm[:, i] - positions_nm[:, j]).norm(dim=-1)
@@ -350,9 +352,10 @@ class EnergyNetwork(nn.Module):
             least, most = extremes.get((shell, low, high), (NO_WALL_NM, 0.0))
             extremes[shell, low, high] = min(least, float(distance.min())), max(most, float(distance.max()))
         for (shell, a, b), (shortest, longest) in extremes.items():
-            self.nearest_nm[shell, [a, b], [b, a]] = shortest / WALL_MARGIN
+            near, far = float(self.nearest_nm[shell, a, b]), float(self.farthest_nm[shell, a, b])
+            self.nearest_nm[shell, [a, b], [b, a]] = min(shortest / WALL_MARGIN, near or NO_WALL_NM)
             if shell < WALLED_SHELLS:
-                self.farthest_nm[shell, [a, b], [b, a]] = longest * WALL_MARGIN
+                self.farthest_nm[shell, [a, b], [b, a]] = max(longest * WALL_MARGIN, far if far < NO_WALL_NM else 0.0)
 
     def prepare(self, topology: Topology, positions_nm: Tensor) -> EdgeWeights:
         """Return what depends on the molecule, and on frames `(rows, n_atoms, 3)` nm by who is near whom."""

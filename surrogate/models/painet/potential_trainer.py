@@ -191,7 +191,7 @@ class Learner:
         self, model: PainetPotential, reference: ReferenceForces, config: PotentialTraining, out: Path, *,
         resume: bool, pretrained: bool = False,
     ) -> None:  # fmt: skip
-        self.model, self.reference, self.config = model, reference, config
+        self.model, self.reference, self.config, self._pretrained = model, reference, config, pretrained
         self.molecule = Molecule.of(reference.scene)
         self.topology = model.topology(self.molecule)
         self.path = samples_path(out)
@@ -359,7 +359,8 @@ class Learner:
         draw = torch.rand(len(learned), members, generator=torch.Generator().manual_seed(1))
         # Each sample is somebody's.
         self._bags = ((draw < _BAG) | (draw == draw.amin(1, keepdim=True))).float()
-        self.model.network.set_walls(self._tensors[0], self.topology)
+        # What weights of other molecules know stays open: a few samples of this one are not all that it does.
+        self.model.network.set_walls(self._tensors[0], self.topology, widen=self._pretrained)
 
 
 def samples_path(out: Path) -> Path:

@@ -100,14 +100,18 @@ def test_it_begins_with_what_other_weights_know(tmp_path: Path) -> None:
     known = tmp_path / "known.safetensors"
     learn_potential(Springs(), known, SMALL, replace(QUICK, steps=100, learning_rate=5e-3, matrix_rate=0.05))
     few = replace(QUICK, steps=2, learning_rate=1e-5, matrix_rate=1e-5)
-    found = {}
-    for name, network in (("fresh", SMALL), ("pretrained", load_weights(known))):
+    found, wide = {}, load_weights(known)
+    walls = wide.model.network.nearest_nm.mul_(0.5).clone()
+    for name, network in (("fresh", SMALL), ("pretrained", wide)):
         out = tmp_path / f"{name}.safetensors"
         learn_potential(Springs(zero_kj_mol=900.0), out, network, few)
         found[name] = load_weights(out)
     fresh, pretrained = (found[name].provenance for name in ("fresh", "pretrained"))
     assert pretrained["force_rms"] < 0.4 * fresh["force_rms"]
     assert pretrained["from"]["hash"] == load_weights(known).hash and "from" not in fresh
+    # What they have seen stays open.
+    assert torch.equal(found["pretrained"].model.network.nearest_nm, walls) and float(walls.max()) > 0.0
+    assert bool((found["fresh"].model.network.nearest_nm >= 1.5 * walls)[walls > 0.0].all())
     # Zeros of energy are those of the molecule that is learned.
     x, energies, _ = Samples.load(
         samples_path(tmp_path / "pretrained.safetensors"), Springs().scene.topology_hash
