@@ -58,7 +58,8 @@ PLAIN: dict[str, Any] = {
     "guard": "resample",
     "seed": 2,
 }
-# Two runs so many of their errors apart have errors that are too small: such a molecule counts as no speed-up.
+# Two runs so many of their errors apart have errors that are too small: such a molecule counts as no speed-up, and so
+# does one whose runs say themselves that they have not converged.
 LARGEST_Z = 3.0
 
 
@@ -138,15 +139,16 @@ def line(name: str, runs: list[Run]) -> tuple[list[str], float]:
     least = [np.min((r.worth_ps() / md_ps)[varies]) for r in runs]
     a, b = runs
     z = float(np.sqrt(np.mean(np.square((a.mean - b.mean)[varies]) / (a.error**2 + b.error**2)[varies])))
-    worth = worth if z < LARGEST_Z else [0.0, 0.0]
+    converged = all(r.result["outcome"]["converged"] for r in runs)
+    none = "not converged" if not converged else "runs disagree" if z >= LARGEST_Z else ""
     shares = ", ".join(f"{r.effective / r.asked:.0%} of {r.asked}" for r in runs)
     rolled = float(np.mean([r["rolled_ps"] for r in (x.result["outcome"] for x in runs)])) * 2e-3
     return [
         name, str(a.result["rates"]["n_atoms"]), f"{rolled:.2g}", f"{md_ps:.0f}", shares,
         f"{max(np.max(r.error[varies]) for r in runs):.2g}", f"{z:.2g}",
-        f"{np.mean(worth):.2g} ({', '.join(f'{w:.2g}' for w in worth)})" if any(worth) else "none: runs disagree",
-        f"{np.mean(least):.2g}",
-    ], float(np.mean(worth))  # fmt: skip
+        f"none: {none}" if none else f"{np.mean(worth):.3g} ({', '.join(f'{w:.3g}' for w in worth)})",
+        "" if none else f"{np.mean(least):.2g}",
+    ], 0.0 if none else float(np.mean(worth))  # fmt: skip
 
 
 def make_table(folder: Path, out: Path | None) -> None:
