@@ -239,7 +239,11 @@ def test_a_reweighted_rollout_is_the_answer_and_claims_no_md() -> None:
         in (found.details)
     )
     assert "agree with the reweighted ones in all 2 states" in found.on_surrogate
-    assert reweighted.to_dict()["populations_by"] == "reweighting" and not reweighted.is_by_surrogate
+    told_of = reweighted.to_dict()
+    assert told_of["populations_by"] == "reweighting" and not reweighted.is_by_surrogate
+    # Monte Carlo turned its torsions.
+    assert "relaxation" not in found.headline and "process" not in found.headline and not told_of["timescales_ps"]
+    assert answer().to_dict()["timescales_ps"] == [900.0]
     assert lines_of("rollout", evaluation(None), reweighted) == reweighted.in_short
     unsure = told("rollout", None, answer=answer(energies=(1000, 20.0), holds=False), by_itself=True)
     assert "are effective; it has not converged" in unsure.in_short[2]
