@@ -240,7 +240,7 @@ def compare(
         known, convergence,
     )  # fmt: skip
     own = list(zip(measured[1 : 1 + n], summaries[1 : 1 + n], rolled, strict=True))
-    known_turned = any(map(_is_turned, thinned[:1] if rep is None else (ref, rep)))
+    known_turned = any(_is_turned(e) for e in (ref, rep) if e is not None)
     evaluations = tuple(_evaluate(setting, m, summary, known_turned or _is_turned(e)) for m, summary, e in own)
     notes += [f"Validity check left out: {x}." for x in baseline.geometry.excluded]
     return Comparison(

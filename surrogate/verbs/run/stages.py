@@ -48,7 +48,7 @@ _LEAST_FRAMES = 20
 _LEFT_OUT_PS = 20.0
 # Of a potential's rollout goes into annealing, at most: what turns once in a ns would keep the state it was built in.
 _ANNEAL_PS, _ANNEAL = 50.0, 0.1
-# In each of its frames, 0.1 ps: what MD turns once in 20 ps these turn in one, for four forces beside 25.
+# In each of its frames, 0.1 ps, for four forces beside 25 (`docs/studies/quantum/reweighted_runs.py`).
 _TORSION_MOVES = 3
 # Of MD's time goes into relaxing frames of a rollout to begin at; in less, fewer replicas begin apart, but so many.
 _STARTING, _LEAST_STARTS = 0.15, 4
