@@ -468,17 +468,19 @@ def trust(given: argparse.Namespace) -> None:
 
 
 def stability(given: argparse.Namespace) -> None:
-    """Roll molecules that are held out, but those that are refused."""
+    """Roll molecules that are held out, but those that are refused. Of several processes each takes its own."""
     weights = load_weights(given.weights)
     refused, whole = 0, []
-    for one in load(given.folder, ["test"], given.molecules):
+    mine, of = given.part
+    out = given.weights.with_name(f"{given.weights.stem}_{mine}.h5")
+    for one in load(given.folder, ["test"], given.molecules)[given.skip :][mine::of]:
         try:
             match_domain(prepare(f"smiles:{one.entry.smiles}"), weights)
         except SurromdError as error:
             refused += 1
             said(f"{one.entry.smiles}: refused: {getattr(error, 'brief', error)}")
             continue
-        whole.append(stays_whole(weights, one.entry.smiles, given.time, given.weights.with_suffix(".h5")))
+        whole.append(stays_whole(weights, one.entry.smiles, given.time, out))
         said(f"{one.entry.smiles}: {100 * whole[-1]:.0f} % of replicas whole")
     said(f"{len(whole)} molecules rolled for {given.time:g} ps in {REPLICAS} replicas, {refused} refused: "
          f"{sum(w == 1.0 for w in whole)} without a replica lost")  # fmt: skip
@@ -524,6 +526,8 @@ def main() -> None:
     tuning.add_argument("--seconds", type=float, nargs="+", default=[60.0, 180.0])
     tuning.add_argument("--molecules", type=int, default=10)
     staying.add_argument("--molecules", type=int, default=50)
+    staying.add_argument("--skip", type=int, default=0, help="first molecules left out")
+    staying.add_argument("--part", type=int, nargs=2, default=[0, 1], metavar=("K", "N"), help="every N-th from K on")
     counting.add_argument("--molecules", type=int, default=18)
     for part in (trusting, staying):
         part.add_argument("--time", type=lambda text: parse_time_ps(text, "--time"), default=250.0)
