@@ -21,6 +21,7 @@ one, beginning with the weights, as `surromd train` does.
 from __future__ import annotations
 
 import argparse
+import json
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -69,7 +70,7 @@ from surrogate.training.loop import Stage, StageConfig, train_stages
 from systems.chemistry.validity import INVALID, geometry_from_scene
 from systems.errors import SimulationError, SurromdError
 from systems.library.named_scenes import prepare
-from systems.scene import ATOMIC_NUMBERS
+from systems.scene import ATOMIC_NUMBERS, Scene
 from systems.trajectory.codec import open_trajectory, reweighting
 from systems.units import parse_time_ps, parse_wall_s
 
@@ -416,10 +417,10 @@ def print_effective(given: argparse.Namespace) -> None:
     said(f"{len(rows)} molecules: off by {off_by:.1f} kJ/mol, {100 * shares:.0f} % effective (medians)")
 
 
-def stays_whole(weights: Weights, smiles: str, time_ps: float, out: Path) -> float:
+def stays_whole(weights: Weights, scene: Scene, time_ps: float, out: Path) -> float:
     """Return the share of replicas whose frames are all valid after so long."""
     try:
-        files = sm.rollout(f"smiles:{smiles}", weights.path, out, time_ps=time_ps, save_every_ps=1.0, guard="flag",
+        files = sm.rollout(scene, weights.path, out, time_ps=time_ps, save_every_ps=1.0, guard="flag",
                            replicas=REPLICAS, seed=SEED, force=True, quiet=True, overwrite=True)  # fmt: skip
     except SimulationError:
         return 0.0
@@ -442,7 +443,7 @@ def trust(given: argparse.Namespace) -> None:
             stepped = in_step(weights, scene).model
             assert isinstance(stepped, PainetPotential)
             spread, n_lost = disagreement(scene, stepped)
-            whole = stays_whole(weights, one.entry.smiles, given.time, given.weights.with_suffix(".h5"))
+            whole = stays_whole(weights, scene, given.time, given.weights.with_suffix(".h5"))
         except SurromdError as error:
             said(f"{one.entry.smiles}: {error}")
             continue
@@ -468,20 +469,23 @@ def trust(given: argparse.Namespace) -> None:
 
 
 def stability(given: argparse.Namespace) -> None:
-    """Roll molecules that are held out, but those that are refused. Of several processes each takes its own."""
+    """Roll molecules that are held out, but those that are refused; prepared scenes are kept in the folder."""
     weights = load_weights(given.weights)
     refused, whole = 0, []
-    mine, of = given.part
-    out = given.weights.with_name(f"{given.weights.stem}_{mine}.h5")
-    for one in load(given.folder, ["test"], given.molecules)[given.skip :][mine::of]:
+    for k, one in enumerate(load(given.folder, ["test"], given.molecules)):
+        if given.places and k not in given.places:
+            continue
+        kept, out = given.folder / f"scene_{k}.json", given.folder / f"stability_{k}.h5"
         try:
-            match_domain(prepare(f"smiles:{one.entry.smiles}"), weights)
+            if not kept.exists():
+                kept.write_text(json.dumps(prepare(f"smiles:{one.entry.smiles}").to_dict()))
+            match_domain(scene := Scene.from_dict(json.loads(kept.read_text())), weights)
         except SurromdError as error:
             refused += 1
-            said(f"{one.entry.smiles}: refused: {getattr(error, 'brief', error)}")
+            said(f"{k} {one.entry.smiles}: refused: {getattr(error, 'brief', error)}")
             continue
-        whole.append(stays_whole(weights, one.entry.smiles, given.time, out))
-        said(f"{one.entry.smiles}: {100 * whole[-1]:.0f} % of replicas whole")
+        whole.append(stays_whole(weights, scene, given.time, out))
+        said(f"{k} {one.entry.smiles}: {100 * whole[-1]:.0f} % of replicas whole")
     said(f"{len(whole)} molecules rolled for {given.time:g} ps in {REPLICAS} replicas, {refused} refused: "
          f"{sum(w == 1.0 for w in whole)} without a replica lost")  # fmt: skip
 
@@ -526,8 +530,7 @@ def main() -> None:
     tuning.add_argument("--seconds", type=float, nargs="+", default=[60.0, 180.0])
     tuning.add_argument("--molecules", type=int, default=10)
     staying.add_argument("--molecules", type=int, default=50)
-    staying.add_argument("--skip", type=int, default=0, help="first molecules left out")
-    staying.add_argument("--part", type=int, nargs=2, default=[0, 1], metavar=("K", "N"), help="every N-th from K on")
+    staying.add_argument("--places", type=int, nargs="+", help="only these of them")
     counting.add_argument("--molecules", type=int, default=18)
     for part in (trusting, staying):
         part.add_argument("--time", type=lambda text: parse_time_ps(text, "--time"), default=250.0)
