@@ -69,6 +69,7 @@ from surrogate.training.devices import choose_device, torch_threads
 from surrogate.training.loop import Stage, StageConfig, train_stages
 from systems.chemistry.validity import INVALID, geometry_from_scene
 from systems.errors import SimulationError, SurromdError
+from systems.files.whole_file import replica_paths
 from systems.library.named_scenes import prepare
 from systems.scene import ATOMIC_NUMBERS, Scene
 from systems.trajectory.codec import open_trajectory, reweighting
@@ -418,10 +419,11 @@ def print_effective(given: argparse.Namespace) -> None:
 
 
 def stays_whole(weights: Weights, scene: Scene, time_ps: float, out: Path) -> float:
-    """Return the share of replicas whose frames are all valid after so long."""
+    """Return the share of replicas whose frames are all valid after so long. What was stopped goes on."""
     try:
-        files = sm.rollout(scene, weights.path, out, time_ps=time_ps, save_every_ps=1.0, guard="flag",
-                           replicas=REPLICAS, seed=SEED, force=True, quiet=True, overwrite=True)  # fmt: skip
+        files = sm.rollout(scene, weights.path, out, time_ps=time_ps, save_every_ps=1.0, guard="flag", force=True,
+                           replicas=REPLICAS, seed=SEED, quiet=True,
+                           resume=replica_paths(out, REPLICAS)[0].exists())  # fmt: skip
     except SimulationError:
         return 0.0
     whole = 0
@@ -443,7 +445,7 @@ def trust(given: argparse.Namespace) -> None:
             stepped = in_step(weights, scene).model
             assert isinstance(stepped, PainetPotential)
             spread, n_lost = disagreement(scene, stepped)
-            whole = stays_whole(weights, scene, given.time, given.weights.with_suffix(".h5"))
+            whole = stays_whole(weights, scene, given.time, given.folder / f"trust_{read_list().index(one.entry)}.h5")
         except SurromdError as error:
             said(f"{one.entry.smiles}: {error}")
             continue
