@@ -8,8 +8,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from systems.chemistry.validity import INVALID, flag_names
 from systems.scene import FloatArray
-from systems.units import GAS_CONSTANT_KJ_MOL_K
+from systems.units import GAS_CONSTANT_KJ_MOL_K, format_time_ps
 
 _G_ML_PER_DA_NM3 = 1.66053906660e-3
 # Fewer frames than this carry no error bar.
@@ -57,12 +58,12 @@ def drift(time_ps: npt.ArrayLike, energy_kj_mol: npt.ArrayLike, n_dof: int) -> d
 
 
 def summarise(
-    time_ps: npt.ArrayLike, scalars: dict[str, FloatArray], *, mass_da: float, ensemble: str, temperature_k: float,
-    n_dof: int,
+    time_ps: npt.ArrayLike, scalars: dict[str, FloatArray], flags: npt.NDArray[np.uint16], *, mass_da: float,
+    ensemble: str, temperature_k: float, n_dof: int,
 ) -> dict[str, Any]:  # fmt: skip
-    """Return the summary of a run's frames, JSON-able: temperature and potential; drift in NVE; volume and density.
-    Frames without a value (written by an older version) are left out. `target` is the bath's temperature, None
-    without."""
+    """Return the summary of a run's frames, JSON-able: temperature and potential; drift in NVE; volume and density; by
+    `flags`, how many frames are another molecule. Frames without a value (written by an older version) are left out.
+    `target` is the bath's temperature, None without."""
     known = {name: values[np.isfinite(values)] for name, values in scalars.items()}
     if not len(known.get("temperature_k", ())):
         return {}
@@ -81,6 +82,10 @@ def summarise(
     if len(known.get("volume_nm3", ())):
         out["volume_nm3"] = mean_and_error(known["volume_nm3"])
         out["density_g_ml"] = mean_and_error(mass_da * _G_ML_PER_DA_NM3 / known["volume_nm3"])
+    if len(changed := np.flatnonzero(flags & INVALID)):
+        what = flag_names(int(np.bitwise_or.reduce(flags)) & INVALID)
+        first_ps = float(np.asarray(time_ps)[changed[0]])
+        out["changed"] = {"n_frames": len(changed), "first_ps": first_ps, "what": what}
     return out
 
 
@@ -106,6 +111,12 @@ def summary_lines(summary: dict[str, Any]) -> list[str]:
         off = float(temperature["mean"] - target)
         if abs(off) > _STANDARD_ERRORS * error + _BIAS * target:
             lines.append(f"warning: the mean temperature is {off:+.1f} K off the bath's; try a shorter `timestep_ps`.")
+    if changed := summary.get("changed"):
+        lines.append(
+            f"warning: {changed['n_frames']} of {summary['n_frames']} frames, the first after "
+            f"{format_time_ps(changed['first_ps'])}, are not the molecule that was given "
+            f"({', '.join(changed['what'])}); they are marked. It does not keep its form at this level."
+        )
     return lines
 
 

@@ -14,10 +14,12 @@ import numpy as np
 import numpy.typing as npt
 
 from md_reference.forces.forcefield import build_system
+from md_reference.forces.spec import QUANTUM
 from md_reference.run.config import MDConfig, check_run, check_same_run, settings_of
 from md_reference.run.engine import Engine, State, refuse_damaged
 from md_reference.run.machine import PlatformChoice, platform_for
 from md_reference.run.run_summary import summarise
+from systems.chemistry.validity import INVALID, check_frames, geometry_from_scene
 from systems.errors import InputError, SimulationError
 from systems.files.schema import built
 from systems.interrupts import deferred_interrupt
@@ -226,8 +228,8 @@ class StoredRun:
         config, mass_da = self.config, float(self.scene.masses_da.sum())
         bath: dict[str, Any] = {"ensemble": config.ensemble, "temperature_k": config.temperature_k}
         for writer in writers:
-            time_ps, scalars = writer.series()
-            summary = summarise(time_ps, scalars, mass_da=mass_da, n_dof=self.n_dof, **bath)
+            time_ps, scalars, flags = writer.series()
+            summary = summarise(time_ps, scalars, flags, mass_da=mass_da, n_dof=self.n_dof, **bath)
             # A resumed run may have become longer than the one that wrote the record.
             length = {"completed": True, "time_ps": config.time_ps}
             writer.update_record({**length, "cost": self.cost(), "summary": summary})
@@ -328,7 +330,14 @@ class _Run(StoredRun):
             velocities_nm_ps=written("velocities_nm_ps") if self.config.save_velocities else None,
             forces_kj_mol_nm=written("forces_kj_mol_nm") if self.config.save_forces else None,
             cell_nm=cells,
+            flags=self._changed(written("positions_nm")),
         )
+
+    def _changed(self, positions_nm: FloatArray) -> npt.NDArray[np.uint16] | None:
+        """Return validity bits of frames where bonds can break; None where a force field keeps them."""
+        if self.config.force.force_field != QUANTUM:
+            return None
+        return check_frames(positions_nm, geometry_from_scene(self.written)) & np.uint16(INVALID)
 
 
 def record_of(scene: Scene, config: MDConfig, choice: PlatformChoice) -> dict[str, Any]:

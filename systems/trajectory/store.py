@@ -384,11 +384,13 @@ class FrameStore(Closing):
         if self._atomic.failure is not None:
             raise self.failed(self._atomic.failure)
 
-    def series(self) -> tuple[Float64Array, dict[str, Float64Array]]:
-        """Return the times `(n_frames,)` ps and the scalars by name of all frames written so far."""
+    def series(self) -> tuple[Float64Array, dict[str, Float64Array], npt.NDArray[np.uint16]]:
+        """Return the times `(n_frames,)` ps, the scalars by name and the flags of all frames written so far."""
         with self._open():
             scalars = {name.rpartition("/")[2]: c[:] for name, c in self._columns.items() if "/scalars/" in name}
-            return self._columns["time"][:], scalars
+            flags = self._columns.get("surromd/flags")
+            time_ps = self._columns["time"][:]
+            return time_ps, scalars, np.zeros(len(time_ps), np.uint16) if flags is None else flags[:]
 
     def _store(self, block: FrameBlock, columns: Columns, stored: Columns) -> None:
         """Append a block and the format's own `columns` (by dataset name). Raises InputError, StorageError. `stored`:

@@ -8,10 +8,12 @@ import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
+import surrogate as sm
 from md_reference.forces.forcefield import resolve
 from md_reference.forces.quantum import KJ_MOL_PER_HARTREE, NM_PER_BOHR, Potential, build_quantum_system
 from md_reference.forces.spec import ForceFieldSpec, at_level
@@ -21,6 +23,7 @@ from systems.errors import InputError, PreparationError, UnknownNameError
 from systems.library.named_scenes import load
 from systems.prepare.molecule import scene_from_smiles
 from systems.scene import FloatArray, Scene
+from systems.trajectory.codec import open_trajectory
 
 pytest.importorskip("tblite")
 SPEC = ForceFieldSpec("gfn2-xtb", "vacuum", None, constrain_hydrogens=False)
@@ -243,3 +246,25 @@ def test_one_thread_is_enough_wherever_openmp_was_loaded_first() -> None:
     )
     done = subprocess.run([sys.executable, "-c", code], env=os.environ | {"OMP_NUM_THREADS": "2"}, capture_output=True)
     assert done.returncode == 0, done.stderr.decode()
+
+
+def test_frames_in_which_md_made_another_molecule_are_marked_and_said(tmp_path: Path) -> None:
+    how: dict[str, Any] = {
+        "level": "gfn2-xtb",
+        "time_ps": 0.2,
+        "equilibrate_ps": 0.01,
+        "save_every_ps": 0.005,
+        "timestep_ps": 5e-4,
+    }
+    (kept,) = sm.reference("smiles:F/C=C/F", tmp_path / "kept.h5", **how)
+    assert sm.info(kept)["invalid_frames"] == 0 and "not the molecule" not in str(sm.info(kept)["details"])
+    (hot,) = sm.reference("smiles:F/C=C/F", tmp_path / "hot.h5", **how, temperature_k=6000.0, friction_per_ps=50.0)
+    found = sm.info(hot)
+    assert 0 < found["invalid_frames"] < found["n_frames"] == 40
+    changed = found["record"]["summary"]["changed"]
+    with open_trajectory(hot) as reader:
+        assert reader.flags is not None
+        first = int(np.flatnonzero(reader.flags)[0])
+        assert changed == {"n_frames": found["invalid_frames"], "first_ps": pytest.approx(reader.time_ps[first]),
+                           "what": changed["what"]}  # fmt: skip
+    assert f"warning: {found['invalid_frames']} of 40 frames" in str(found["details"])
