@@ -58,7 +58,7 @@ def repeated(system: openmm.System, times: int) -> openmm.System:
 
 
 def make(given: argparse.Namespace) -> None:
-    """Prepare one cell, let it settle for 10 ps, and repeat it."""
+    """Prepare one cell, which `alanine_dipeptide.py simd` takes, too, let it settle for 10 ps, and repeat it."""
     from alanine_dipeptide import SPEC
 
     from md_reference.forces.forcefield import build_system
@@ -86,6 +86,7 @@ def make(given: argparse.Namespace) -> None:
     np.savez_compressed(given.folder / "state.npz", x=x, n_solute=dry.n_atoms)
     (given.folder / "system.xml").write_text(openmm.XmlSerializer.serialize(many))
     (given.folder / "solute.json").write_text(json.dumps(dry.to_dict()))
+    (given.folder / "scene.json").write_text(json.dumps(scene.to_dict()))
     sys.stdout.write(f"{len(x)} cells of {scene.n_atoms} atoms, {of_many / len(x):.2f} kJ/mol each; one {energy:.2f}\n")
 
 
