@@ -68,7 +68,7 @@ def main() -> None:
     else:
         scene = Scene.from_dict(json.loads(path.read_text()))
     config = MDConfig(
-        force=SPEC, time_ps=parse_time_ps(args.time), save_every_ps=1.0, keep="solute", platform=args.what
+        force=SPEC, time_ps=parse_time_ps(args.time), keep="solute", platform=args.what
     )
     if args.what == "simd":
         outs = [args.folder / f"simd_r{k}.h5" for k in range(args.replicas or n_replicas())]
