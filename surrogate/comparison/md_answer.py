@@ -146,10 +146,10 @@ class Answer:
         elif not self.states and self.holds:
             use, what = f"Use {self.whose} frames.", "For the distribution of all torsions: each has a single state."
         elif not self.is_sure:
-            use, what = (
-                f"Do not use {self.whose} populations yet.",
-                f"They show which states there are: {len(self.states)}.",
-            )
+            what, shown = "No torsion has two states.", "frames"
+            if n := len(self.states):
+                what, shown = f"They show which states there are: {n}.", "populations"
+            use = f"Do not use {self.whose} {shown} yet."
         else:
             widest = 100 * max((s.error for s in weighted), default=0.0)
             use = "Use the reweighted rollout" if self.is_reweighted else "Use MD's answer"

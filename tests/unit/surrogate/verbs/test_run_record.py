@@ -180,6 +180,8 @@ def test_an_answer_that_does_not_hold_is_not_to_be_used() -> None:
     stuck = answer(timescales_ps=(), missing=("not connected: ALA 2 β",), states=(state(surrogate=0.9),))
     assert "cannot say whether" in told("rollout", None, answer=stuck).details, "one state, and what was never left"
     assert told("rollout", None, answer=stuck).in_short[0] == "Do not use MD's populations yet."
+    few = told("rollout", None, answer=answer(states=(), missing=("only 3 of 896 frames are effective",), holds=False))
+    assert few.in_short[0] == "Do not use MD's frames yet." and few.in_short[1].startswith("No torsion has two states.")
     part = told("rollout", None, answer=answer(missing=("ALA 2 left-handed: not connected",)))
     assert "but for what it did not connect" in part.in_short[0] and "ALA 2 left-handed" in part.in_short[1]
     assert told("rollout", None).in_short == ("Use it.", "Right: all.", "Why: so."), "no torsion turns"
