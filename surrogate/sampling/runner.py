@@ -254,9 +254,12 @@ class _Rollout:
         done_ps = self.state.steps * plan.weights.domain.lag_ps
         at = f"after {format_time_ps(done_ps)}" if done_ps else "in its first chunk"
         if plan.config.guard in ("off", "flag"):
-            advice = f"the frames are marked in {out}. Try `precision='fp32'`, `guard='repair'` or other weights."
+            finer = "`precision='fp32'`, " if self.sampler.precision.bf16 else ""
+            advice = f"the frames are marked in {out}. Try {finer}`guard='repair'` or other weights."
             if plan.config.guard == "flag":
                 advice += " With `guard='off'` nothing stops it."
+            if isinstance(plan.weights.model, Potential):
+                advice += " MD at the level of the weights may do the same: `surromd reference` tells."
         else:
             advice = f"the frames before are in {out}. Use other weights, or `surromd reference` for this molecule."
         return f"replica {row}, {at}: {reason}; {advice}"

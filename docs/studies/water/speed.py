@@ -31,7 +31,7 @@ from md_reference.simd.force_field import SimdReplicas, aligned
 from systems.library.named_scenes import prepare
 
 SPEC = ForceFieldSpec("ff14SB", "tip3p")
-PADDINGS_NM = (1.0, 1.5, 2.0, 2.2)
+PADDINGS_NM = (1.0, 1.5, 2.0, 2.2, 2.5)
 PARTS = ("pair list", "water and water", "solute and water", "within the solute", "charges to the grid", "transforms",
          "forces from the grid")  # fmt: skip
 STEPS, ROUNDS, APART_STEPS = 50, 7, 5000
