@@ -14,14 +14,10 @@ from torch import Tensor
 from known_answers import pair_energy
 from surrogate.models.conformance import PotentialContract, branched_chain
 from surrogate.models.painet import energy as room
-from surrogate.models.painet.energy import (
-    PainetPotential,
-    PotentialConfig,
-    bonded_shells,
-    find_edges,
-    latent_energy,
-    simd_potential_of,
-)
+from surrogate.models.painet import simd
+from surrogate.models.painet.energy import PotentialConfig, bonded_shells, find_edges, latent_energy
+from surrogate.models.painet.potential import PainetPotential
+from surrogate.models.painet.simd import simd_potential_of
 from surrogate.models.potential import Own, RigidBonds
 from surrogate.models.propagator import Molecule, Propagator
 from systems.errors import InputError
@@ -146,7 +142,7 @@ def test_steps_by_simd_are_those_of_torch(timestep_ps: float, rows: int, monkeyp
 
     found = moved(lively(config))
     with monkeypatch.context() as without:
-        without.setattr("surrogate.models.painet.energy.simd_potential_of", lambda *_, **__: None)
+        without.setattr("surrogate.models.painet.potential.simd_potential_of", lambda *_, **__: None)
         expected = moved(lively(config))
     for one, other in zip(found, expected, strict=True):
         torch.testing.assert_close(one, other, rtol=0, atol=1e-4 * float((other - other.mean(0)).abs().max()))
@@ -183,7 +179,7 @@ def test_simd_is_for_single_precision_few_atoms_and_a_model_at_rest(monkeypatch:
     assert by_simd(lively(), 9)
     assert not by_simd(lively().double(), 9) and not by_simd(lively(), 80)
     monkeypatch.setenv("PATH", "")
-    room._program.cache_clear()
+    simd._program.cache_clear()
     assert not by_simd(lively(), 9), "without a compiler"
 
 

@@ -10,7 +10,8 @@ from drug_like_states import RECOMBINED, Entry, file_of, make_compact, read_list
 from recorded import Recorded
 from torch import nn
 
-from surrogate.models.painet.energy import PainetPotential, PotentialConfig, Topology
+from surrogate.models.painet.energy import PotentialConfig, Topology
+from surrogate.models.painet.potential import PainetPotential
 from surrogate.models.propagator import Molecule
 
 # Ethanol and acetate without its hydrogens: of two sizes, and one with a charge.

@@ -18,7 +18,8 @@ import torch
 
 from md_reference.forces.quantum import Potential
 from surrogate.models.architecture import weights_path
-from surrogate.models.painet.energy import PainetPotential, PotentialConfig
+from surrogate.models.painet.energy import PotentialConfig
+from surrogate.models.painet.potential import PainetPotential
 from surrogate.models.potential import gradient_of
 from surrogate.models.propagator import Molecule
 from surrogate.models.weights import read_header

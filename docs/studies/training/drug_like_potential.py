@@ -55,12 +55,12 @@ from surrogate.models.painet.energy import (
     WALL,
     Edges,
     EnergyNetwork,
-    PainetPotential,
     PotentialConfig,
     Topology,
     measure_edges,
 )
 from surrogate.models.painet.model import dense_mean
+from surrogate.models.painet.potential import PainetPotential
 from surrogate.models.painet.potential_trainer import conditions_of
 from surrogate.models.propagator import Molecule
 from surrogate.models.weights import Chemistry, TrainingDomain, Weights, load_weights, provenance_of, save_weights

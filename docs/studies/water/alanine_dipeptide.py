@@ -67,9 +67,7 @@ def main() -> None:
         scene = solvate(dry, SPEC, WaterBox(padding_nm=quantity("padding_nm", args.padding)))
     else:
         scene = Scene.from_dict(json.loads(path.read_text()))
-    config = MDConfig(
-        force=SPEC, time_ps=parse_time_ps(args.time), keep="solute", platform=args.what
-    )
+    config = MDConfig(force=SPEC, time_ps=parse_time_ps(args.time), keep="solute", platform=args.what)
     if args.what == "simd":
         outs = [args.folder / f"simd_r{k}.h5" for k in range(args.replicas or n_replicas())]
         simulate_batch(scene, config, outs, resume=any(out.exists() for out in outs))

@@ -14,8 +14,9 @@ import torch
 from md_reference.forces.quantum import Potential
 from surrogate.comparison.read.ensemble import load_ensemble
 from surrogate.models.architecture import weights_path
-from surrogate.models.painet.energy import PainetPotential, PotentialConfig
+from surrogate.models.painet.energy import PotentialConfig
 from surrogate.models.painet.model import Painet, PainetConfig
+from surrogate.models.painet.potential import PainetPotential
 from surrogate.models.weights import TrainingDomain, Weights, load_weights
 from surrogate.sampling import runner
 from surrogate.sampling.domain import in_bath
