@@ -1,17 +1,22 @@
-"""Alanine dipeptide in TIP3P water: the same System by OpenMM's CPU platform and by SIMD replicas.
+"""Alanine dipeptide in TIP3P water: the same System by OpenMM and by SIMD replicas.
 
     python docs/studies/water/alanine_dipeptide.py scene FOLDER             # solvated, at the mean volume of 1 bar
     python docs/studies/water/alanine_dipeptide.py openmm FOLDER --time 20ns --replicas 3
     python docs/studies/water/alanine_dipeptide.py simd FOLDER --time 60ns
     python docs/studies/water/alanine_dipeptide.py simd FOLDER --time 60ns --padding 3.3nm    # twice the cell's width
+    python docs/studies/water/alanine_dipeptide.py table FOLDER -o TABLE    # simd_r*.h5, supercell.py's solute_r*.h5
 
-A run that was stopped goes on. `surromd compare` compares what they leave.
+A run that was stopped goes on. `table` leaves out the first 200 ps of each replica: share of psi in the alpha basin
+(-120 to 80 degrees), the integral of the autocorrelation of cos psi and cos phi up to where it falls below 0.05, and
+the Jensen-Shannon distance (natural logarithm, square root) of phi/psi maps of 36 x 36 bins, each of as many replicas
+as half of the smaller set has, mean over random draws. Errors are over replicas, one left out after the other.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -22,15 +27,20 @@ from md_reference.forces.solvation import solvate
 from md_reference.forces.spec import ForceFieldSpec, WaterBox
 from md_reference.run.config import Conditions, MDConfig
 from md_reference.run.engine import Engine
+from md_reference.run.machine import machine_name
 from md_reference.run.replicas import simulate_batch
 from md_reference.run.simulate import simulate
 from md_reference.simd.force_field import n_replicas
+from surrogate.comparison.measure.distributions import distance, is_alpha
+from systems.chemistry.geometry import torsion
 from systems.library.named_scenes import prepare
-from systems.scene import Scene
+from systems.scene import FloatArray, Scene
+from systems.trajectory.codec import open_trajectory
 from systems.units import parse_time_ps, quantity
 
 SPEC = ForceFieldSpec("ff14SB", "tip3p")
 VOLUME_PS, DISCARDED = 500.0, 0.2
+SETTLED = 200
 
 
 def at_one_bar(scene: Scene, *, seed: int) -> Scene:
@@ -49,14 +59,84 @@ def at_one_bar(scene: Scene, *, seed: int) -> Scene:
     return replace(scene, positions_nm=state.positions_nm * scale, cell_nm=state.cell_nm * scale)
 
 
+def angles_of(folder: Path, kind: str) -> list[FloatArray]:
+    """Return phi and psi `(n_frames, 2)` in radians of each replica, frames 1 ps apart."""
+    found = []
+    for k in range(len(list(folder.glob(f"{kind}_r*.h5")))):
+        with open_trajectory(folder / f"{kind}_r{k}.h5") as reader:
+            assert reader.scene is not None
+            names = reader.scene.atom_names
+            backbone = [i for i, name in enumerate(names) if name in ("C", "N", "CA")][:5]
+            assert [names[i] for i in backbone] == ["C", "N", "CA", "C", "N"]
+            quads = np.array([backbone[:4], backbone[1:]])
+            found.append(np.asarray(torsion(reader.read()[SETTLED:].astype(np.float64), quads)))
+    return found
+
+
+def memory_ps(values: Sequence[FloatArray]) -> float:
+    """Return the integral of the autocorrelation of series of equal steps of 1 ps, up to where it is below 0.05."""
+    mean, variance = np.concatenate(values).mean(), np.concatenate(values).var()
+    total = 0.5
+    for lag in range(1, min(map(len, values))):
+        now = np.concatenate([(x[lag:] - mean) * (x[:-lag] - mean) for x in values]).mean() / variance
+        if now < 0.05:
+            break
+        total += float(now)
+    return total
+
+
+def with_error(of: Callable[[Sequence[FloatArray]], float], runs: Sequence[FloatArray]) -> str:
+    n = len(runs)
+    without = [of([*runs[:k], *runs[k + 1 :]]) for k in range(n)]
+    return f"{of(runs):.3g} ± {np.sqrt((n - 1) * np.var(without)):.2g}"
+
+
+def apart(one: Sequence[FloatArray], other: Sequence[FloatArray], n: int) -> str:
+    """Return the mean distance and its spread of maps of `n` replicas of either set, which may be the same."""
+    rng, found = np.random.default_rng(0), []
+    for _ in range(50):
+        first = rng.permutation(len(one))
+        second = first[n:] if one is other else rng.permutation(len(other))
+        maps = [np.histogramdd(np.concatenate([runs[k] for k in chosen[:n]]), 36, [(-np.pi, np.pi)] * 2)[0].ravel()
+                for runs, chosen in ((one, first), (other, second))]  # fmt: skip
+        found.append(float(distance(*maps)))
+    return f"{np.mean(found):.3f} ± {np.std(found):.3f}"
+
+
+def make_table(folder: Path, out: Path) -> None:
+    sets = {"OpenMM": angles_of(folder, "solute"), "SIMD": angles_of(folder, "simd")}
+    half = min(map(len, sets.values())) // 2
+    measures: dict[str, Callable[[Sequence[FloatArray]], float]] = {
+        "psi in the alpha basin, %": lambda runs: 100 * float(is_alpha(np.concatenate(runs)[:, 1]).mean()),
+        "cos psi remembered, ps": lambda runs: memory_ps([np.cos(x[:, 1]) for x in runs]),
+        "cos phi remembered, ps": lambda runs: memory_ps([np.cos(x[:, 0]) for x in runs]),
+    }
+    rows = [[name, *(with_error(of, runs) for runs in sets.values())] for name, of in measures.items()]
+    openmm, simd = sets.values()
+    name = f"phi/psi maps of {half} replicas, distance from OpenMM's"
+    rows.append([name, apart(openmm, openmm, half), apart(openmm, simd, half)])
+    table = {
+        "command": "python docs/studies/water/alanine_dipeptide.py table FOLDER",
+        "machine": f"SIMD: {machine_name()}; OpenMM: OpenCL, one H200 GPU",
+        "note": "; ".join(f"{name}: {len(runs)} x {len(runs[0]) / 1e3:.2f} ns" for name, runs in sets.items()),
+        "columns": ["", *sets],
+        "rows": rows,
+    }
+    out.write_text(json.dumps(table, ensure_ascii=False, indent=1) + "\n", "utf-8")
+
+
 def main() -> None:
     parser = argparse.ArgumentParser()
-    parser.add_argument("what", choices=("scene", "openmm", "simd"))
+    parser.add_argument("what", choices=("scene", "openmm", "simd", "table"))
     parser.add_argument("folder", type=Path)
     parser.add_argument("--time", default="20ns")
     parser.add_argument("--replicas", type=int, default=0, help="0: 3 by OpenMM, a batch by SIMD")
     parser.add_argument("--padding", help="distance between images, in a cell of its own at the volume of 1 bar")
+    parser.add_argument("-o", "--out", type=Path)
     args = parser.parse_args()
+    if args.what == "table":
+        make_table(args.folder, args.out)
+        return
     args.folder.mkdir(parents=True, exist_ok=True)
     path = args.folder / "scene.json"
     dry = prepare("alanine-dipeptide")

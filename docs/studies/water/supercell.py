@@ -117,13 +117,13 @@ def run(given: argparse.Namespace) -> None:
 
 
 def files(given: argparse.Namespace) -> None:
-    """Write each solute's trajectory after the first `--settle` ps."""
+    """Write each solute's trajectory."""
     from systems.scene import Scene
     from systems.trajectory.codec import open_writer
 
     scene = Scene.from_dict(json.loads((given.folder / "solute.json").read_text()))
     with np.load(given.folder / "solutes.npz") as data:
-        x = data["x"][round(given.settle / SAVE_PS) :]
+        x = data["x"]
     for k in range(x.shape[1]):
         with open_writer(given.folder / f"solute_r{k}.h5", scene, {"temperature_k": TEMPERATURE_K}) as writer:
             writer.append(x[:, k], SAVE_PS * (1.0 + np.arange(len(x))))
@@ -137,7 +137,6 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=150.0)
     parser.add_argument("--platform", default="OpenCL")
     parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--settle", type=float, default=200.0, help="ps left out")
     given = parser.parse_args()
     {"make": make, "run": run, "files": files}[given.what](given)
 
