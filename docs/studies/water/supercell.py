@@ -59,19 +59,17 @@ def repeated(system: openmm.System, times: int) -> openmm.System:
 
 def make(given: argparse.Namespace) -> None:
     """Prepare one cell, which `alanine_dipeptide.py simd` takes, too, let it settle for 10 ps, and repeat it."""
-    from alanine_dipeptide import SPEC
-
     from md_reference.forces.forcefield import build_system
     from md_reference.forces.solvation import solvate
-    from md_reference.forces.spec import WaterBox
+    from md_reference.forces.spec import ForceFieldSpec, WaterBox
     from md_reference.run.config import Conditions
     from md_reference.run.engine import Engine
     from systems.library.named_scenes import prepare
 
-    dry = prepare("alanine-dipeptide")
-    scene = solvate(dry, SPEC, WaterBox())
-    system = build_system(scene, SPEC)
-    with Engine(scene, Conditions(force=SPEC, platform="CPU", seed=1), system=system) as engine:
+    dry, spec = prepare("alanine-dipeptide"), ForceFieldSpec("ff14SB", "tip3p")
+    scene = solvate(dry, spec, WaterBox())
+    system = build_system(scene, spec)
+    with Engine(scene, Conditions(force=spec, platform="CPU", seed=1), system=system) as engine:
         engine.minimise(max_iterations=500)
         engine.thermalise()
         engine.step(2_500)
