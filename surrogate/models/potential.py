@@ -10,13 +10,14 @@ from dataclasses import dataclass, replace
 from typing import Any, NamedTuple, Self
 
 import torch
+from scipy.optimize import minimize
 from torch import Tensor
 
 from surrogate.models.architecture import ModelConfig
 from surrogate.models.propagator import Chunk, Molecule, Propagator
 from systems.chemistry.graph import beyond, bonded_graph, rotatable_torsions
 from systems.errors import InputError
-from systems.scene import Scene
+from systems.scene import FloatArray, Scene
 from systems.units import GAS_CONSTANT_KJ_MOL_K, whole_steps
 
 # Frames (rows, n_atoms, 3) nm -> the members' energies (rows, n_members)
@@ -151,6 +152,7 @@ class Potential(Propagator):
     """
 
     config: Any
+    _rest: tuple[int, Tensor, Tensor] | None = None
 
     @abstractmethod
     def energies(self, positions_nm: Tensor, molecule: Molecule) -> Tensor:
@@ -206,18 +208,20 @@ class Potential(Propagator):
         return replace(molecule, own=Own(rigid, turns if turns is not None and len(turns.ends) else None))
 
     def _minimum_nm(self, positions_nm: Tensor, molecule: Molecule) -> Tensor:
-        with torch.inference_mode(False), torch.enable_grad():
-            x = positions_nm.clone().requires_grad_(True)
-            descent = torch.optim.LBFGS([x], max_iter=_RELAXED_ROUNDS, line_search_fn="strong_wolfe")
+        """Return the nearest minimum `(n_atoms, 3)` nm. The last is kept: a scene is asked for several times."""
+        version = sum(p._version for p in self.parameters())
+        if self._rest is None or self._rest[0] != version or not torch.equal(self._rest[1], positions_nm):
+            compute = gradient_of(lambda x: self.energies(x, molecule))
 
-            def energy() -> Tensor:
-                descent.zero_grad()
-                total = self.energies(x[None], molecule).mean()
-                (x.grad,) = torch.autograd.grad(total, x)
-                return total.detach()
+            def energy(flat: FloatArray) -> tuple[float, FloatArray]:
+                members, gradient = compute(torch.from_numpy(flat).view(1, -1, 3))
+                return float(members.mean()), gradient.numpy().ravel()
 
-            descent.step(energy)
-            return x.detach()
+            # torch's own L-BFGS takes two seconds to import what it compiles with.
+            found = minimize(energy, positions_nm.numpy().ravel(), jac=True, method="L-BFGS-B",
+                             options={"maxiter": _RELAXED_ROUNDS})  # fmt: skip
+            self._rest = version, positions_nm, torch.from_numpy(found.x).view(-1, 3)
+        return self._rest[2]
 
     def noise_shape(self, n_atoms: int) -> tuple[int, ...]:
         """One vector an atom for the first velocities, then for each step; before a frame's steps those of its torsion

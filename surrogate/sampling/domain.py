@@ -156,6 +156,8 @@ def cover_molecule(scene: Scene, domain: TrainingDomain, known: Chemistry) -> tu
 def disagreement(scene: Scene, model: PainetPotential) -> tuple[float, int]:
     """Return by how much a potential's members differ on forces in short MD of a molecule (`PainetPotential.spread`,
     kJ/mol/nm, the median of its replicas), and how many of sixteen replicas do not stay this molecule."""
+    # As it will be rolled, so that its minimum is known there.
+    scene = in_standard_pose(scene)
     molecule = model.featurise(scene)
     x = torch.tensor(scene.positions_nm, dtype=torch.float32).expand(_ASKED_COPIES, 1, -1, -1)
     generators = [torch.Generator().manual_seed(seed) for seed in range(_ASKED_COPIES)]

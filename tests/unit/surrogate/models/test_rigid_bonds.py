@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import copy
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 from torch import Tensor
@@ -84,6 +86,36 @@ def test_bonds_to_hydrogen_are_rigid_above_2_fs_alone(paracetamol: tuple[PainetP
 
 def replace_lag(model: PainetPotential, lag_ps: float, n_new: int) -> PainetPotential:
     return model.in_bath({"lag_ps": lag_ps, "n_new": n_new})
+
+
+def test_rigid_bonds_are_those_of_the_nearest_minimum_which_is_looked_for_once(
+    paracetamol: tuple[PainetPotential, Scene], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    model, scene = copy.deepcopy(paracetamol[0]), paracetamol[1]
+    evaluated: list[Tensor] = []
+    energies = model.energies
+    monkeypatch.setattr(model, "energies", lambda x, molecule: evaluated.append(x) or energies(x, molecule))
+    molecule = model.featurise(scene)
+    n = len(evaluated)
+    assert n > 10
+    (at,), forces = evaluated[-1].detach().double(), model.evaluate(evaluated[-1].detach(), molecule)[1]
+    assert float(forces.abs().max()) < 30.0 < float(model.evaluate(evaluated[0].detach(), molecule)[1].abs().max())
+    assert molecule.own is not None and molecule.own.rigid is not None
+    rigid: RigidBonds = molecule.own.rigid
+    bonds = torch.stack([rigid.first, rigid.second], dim=1)
+    torch.testing.assert_close(lengths(at, bonds), rigid.length2.sqrt().flatten(), rtol=1e-3, atol=0)
+    n = len(evaluated)
+    model.in_bath({"temperature_k": 400.0}).featurise(scene)
+    assert len(evaluated) == n, "kept"
+    with torch.no_grad():
+        next(model.parameters()).mul_(1.001)
+    model.featurise(scene)
+    assert len(evaluated) > n, "other weights"
+    n = len(evaluated)
+    model.featurise(
+        scene.with_positions(scene.positions_nm + 0.01 * np.sin(np.arange(3.0 * scene.n_atoms)).reshape(-1, 3))
+    )
+    assert len(evaluated) > n, "another structure"
 
 
 def test_energy_is_kept_at_4_fs_without_a_bath(paracetamol: tuple[PainetPotential, Scene]) -> None:

@@ -120,7 +120,7 @@ def test_annealed_replicas_start_all_over(tmp_path: Path, monkeypatch: pytest.Mo
     frames: list[int] = []
 
     def rolled(name: str, anneal_ps: float) -> Any:
-        outs = [tmp_path / f"{name}_r{k}.h5" for k in range(3)]
+        outs = [tmp_path / f"{name}_r{k}.h5" for k in range(4)]
         rollout(scene, loaded, outs, RolloutConfig(time_ps=0.1, guard="off", anneal_ps=anneal_ps))
         frames = [scene.positions_nm, *(open_trajectory(out).read()[0] for out in outs)]
         run = mdtraj.Trajectory(np.stack(frames), scene.to_mdtraj_topology())
