@@ -39,8 +39,9 @@ _APART, _LEAST_APART = 2.5, 0.02
 _CONTRADICTS = 4.0
 # What a surrogate is taken to be off by in the population of a state: weights keep no such number.
 MODEL_ERROR = 0.1
-# Fewer effective frames (Kish) of a rollout that is reweighted tell no populations.
-_LEAST_EFFECTIVE = 50.0
+# Fewer effective frames (Kish) of a rollout that is reweighted tell no populations; where they are a smaller share of
+# those asked for, asking for more does not help.
+_LEAST_EFFECTIVE, _LEAST_SHARE = 50.0, 0.1
 # A state that has a smaller share of a rollout is no reason to begin there.
 _DRAWN_SHARE = 2e-3
 
@@ -316,7 +317,10 @@ def md_answer(
         asked = len(known), float(known.sum() ** 2 / np.square(known).sum())
         weights = _reweighted(found, micro, counting)
         if asked[1] < _LEAST_EFFECTIVE:
-            missing.append(f"only {asked[1]:.0f} of {asked[0]} frames are effective, the surrogate is too far off")
+            why = ": a longer `budget` asks for more"
+            if asked[1] < _LEAST_SHARE * asked[0]:
+                why = ", the surrogate is too far off: give one of this molecule (`surromd train`) as `weights`"
+            missing.append(f"only {asked[1]:.0f} of {asked[0]} frames are effective{why}")
     return Answer(
         method=found.method,
         n_replicas=found.n_own,

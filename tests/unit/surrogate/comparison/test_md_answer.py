@@ -145,7 +145,11 @@ def test_a_rollout_is_reweighted_by_the_energies_of_its_reference(forms: np.ndar
     wrong = md_answer(ensemble(forms, states), 300.0, factors=[1.0 / f for f in factors])
     assert not any(s.share > 0.05 for s in wrong.states if s.state == "left-handed"), "negative control: the sign"
     few = [np.where(np.arange(400) < 1, f, np.nan) for f in np.exp(lower)]
-    assert not md_answer(ensemble(forms, states), 300.0, factors=few).holds
+    short = md_answer(ensemble(forms, states), 300.0, factors=few)
+    assert not short.holds and "of 32 frames are effective: a longer `budget`" in " ".join(short.missing)
+    rare = np.where(np.random.default_rng(5).random(states.shape) < 0.003, 1e4, 1.0)
+    poor = md_answer(ensemble(forms, states), 300.0, factors=[*np.where(asked, rare, np.nan)])
+    assert not poor.holds and "give one of this molecule" in " ".join(poor.missing)
 
 
 def test_all_frames_tell_by_how_much_those_that_were_asked_are_off(
