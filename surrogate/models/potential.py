@@ -10,7 +10,6 @@ from dataclasses import dataclass, replace
 from typing import Any, NamedTuple, Self
 
 import torch
-from scipy.optimize import minimize
 from torch import Tensor
 
 from surrogate.models.architecture import ModelConfig
@@ -211,13 +210,15 @@ class Potential(Propagator):
         """Return the nearest minimum `(n_atoms, 3)` nm. The last is kept: a scene is asked for several times."""
         version = sum(p._version for p in self.parameters())
         if self._rest is None or self._rest[0] != version or not torch.equal(self._rest[1], positions_nm):
+            # torch's own L-BFGS takes two seconds to import what it compiles with.
+            from scipy.optimize import minimize
+
             compute = gradient_of(lambda x: self.energies(x, molecule))
 
             def energy(flat: FloatArray) -> tuple[float, FloatArray]:
                 members, gradient = compute(torch.from_numpy(flat).view(1, -1, 3))
                 return float(members.mean()), gradient.numpy().ravel()
 
-            # torch's own L-BFGS takes two seconds to import what it compiles with.
             found = minimize(energy, positions_nm.numpy().ravel(), jac=True, method="L-BFGS-B",
                              options={"maxiter": _RELAXED_ROUNDS})  # fmt: skip
             self._rest = version, positions_nm, torch.from_numpy(found.x).view(-1, 3)

@@ -16,7 +16,7 @@ import torch
 
 from surrogate.data import in_standard_pose
 from surrogate.models.architecture import architecture, shipped_weights
-from surrogate.models.painet.potential import PainetPotential
+from surrogate.models.painet.painet_potential import PainetPotential
 from surrogate.models.peptides.chains import FREE_ENDS
 from surrogate.models.peptides.layout import PeptideConfig, chain_features, standard_peptide
 from surrogate.models.peptides.model import PeptideSlide

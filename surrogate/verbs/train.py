@@ -265,7 +265,7 @@ def learn_molecule(
     scene = prepare_scene(given, Preparation(), quiet=options.quiet)
 
     from md_reference.run.labeller import Labeller
-    from surrogate.models.painet.potential import PainetPotential
+    from surrogate.models.painet.painet_potential import PainetPotential
     from surrogate.models.painet.potential_trainer import PotentialTrainer
 
     trainer: PotentialTrainer = architecture(POTENTIAL).trainer()

@@ -16,7 +16,7 @@ from surrogate.models.conformance import PotentialContract, branched_chain
 from surrogate.models.painet import energy as room
 from surrogate.models.painet import simd
 from surrogate.models.painet.energy import PotentialConfig, bonded_shells, find_edges, latent_energy
-from surrogate.models.painet.potential import PainetPotential
+from surrogate.models.painet.painet_potential import PainetPotential
 from surrogate.models.painet.simd import simd_potential_of
 from surrogate.models.potential import Own, RigidBonds
 from surrogate.models.propagator import Molecule, Propagator
@@ -142,7 +142,7 @@ def test_steps_by_simd_are_those_of_torch(timestep_ps: float, rows: int, monkeyp
 
     found = moved(lively(config))
     with monkeypatch.context() as without:
-        without.setattr("surrogate.models.painet.potential.simd_potential_of", lambda *_, **__: None)
+        without.setattr("surrogate.models.painet.painet_potential.simd_potential_of", lambda *_, **__: None)
         expected = moved(lively(config))
     for one, other in zip(found, expected, strict=True):
         torch.testing.assert_close(one, other, rtol=0, atol=1e-4 * float((other - other.mean(0)).abs().max()))

@@ -11,7 +11,7 @@ from recorded import Recorded
 from torch import nn
 
 from surrogate.models.painet.energy import PotentialConfig, Topology
-from surrogate.models.painet.potential import PainetPotential
+from surrogate.models.painet.painet_potential import PainetPotential
 from surrogate.models.propagator import Molecule
 
 # Ethanol and acetate without its hydrogens: of two sizes, and one with a charge.

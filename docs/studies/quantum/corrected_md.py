@@ -26,7 +26,7 @@ from torch import Tensor
 
 from md_reference.forces.quantum import Potential
 from surrogate.models.architecture import weights_path
-from surrogate.models.painet.potential import PainetPotential
+from surrogate.models.painet.painet_potential import PainetPotential
 from surrogate.models.propagator import Molecule
 from surrogate.models.weights import Weights, load_weights
 from systems.chemistry.graph import bonded_graph, rotatable_torsions, turned

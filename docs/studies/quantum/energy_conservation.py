@@ -23,7 +23,7 @@ from torch import Tensor
 
 from md_reference.run.machine import machine_name
 from surrogate.models.architecture import weights_path
-from surrogate.models.painet.potential import PainetPotential
+from surrogate.models.painet.painet_potential import PainetPotential
 from surrogate.models.propagator import Molecule
 from surrogate.models.weights import load_weights
 from systems.scene import FloatArray

@@ -20,7 +20,7 @@ import torch
 
 from md_reference.run.machine import machine_name
 from surrogate.models.painet.energy import PotentialConfig
-from surrogate.models.painet.potential import PainetPotential
+from surrogate.models.painet.painet_potential import PainetPotential
 from surrogate.models.painet.potential_trainer import Learner, PotentialTraining, samples_path
 from surrogate.models.weights import load_weights
 from surrogate.training.loop import Stage, StageConfig, StagePlace, run_stage

@@ -19,7 +19,7 @@ import torch
 from md_reference.forces.quantum import Potential
 from surrogate.models.architecture import weights_path
 from surrogate.models.painet.energy import PotentialConfig
-from surrogate.models.painet.potential import PainetPotential
+from surrogate.models.painet.painet_potential import PainetPotential
 from surrogate.models.potential import gradient_of
 from surrogate.models.propagator import Molecule
 from surrogate.models.weights import read_header

@@ -60,7 +60,7 @@ from surrogate.models.painet.energy import (
     measure_edges,
 )
 from surrogate.models.painet.model import dense_mean
-from surrogate.models.painet.potential import PainetPotential
+from surrogate.models.painet.painet_potential import PainetPotential
 from surrogate.models.painet.potential_trainer import conditions_of
 from surrogate.models.propagator import Molecule
 from surrogate.models.weights import Chemistry, TrainingDomain, Weights, load_weights, provenance_of, save_weights

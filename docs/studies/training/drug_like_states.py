@@ -42,7 +42,7 @@ from md_reference.forces.quantum import Potential
 from md_reference.forces.spec import ForceFieldSpec
 from md_reference.run.config import Conditions
 from md_reference.run.engine import Engine
-from surrogate.models.painet.potential import PainetPotential
+from surrogate.models.painet.painet_potential import PainetPotential
 from surrogate.models.propagator import draw_noise
 from surrogate.models.weights import load_weights
 from systems.chemistry.distance_bonds import changed_bond

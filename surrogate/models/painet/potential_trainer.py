@@ -16,7 +16,7 @@ from torch import Tensor
 from surrogate.data import References
 from surrogate.models import architecture as arch
 from surrogate.models.painet.energy import PotentialConfig
-from surrogate.models.painet.potential import PainetPotential
+from surrogate.models.painet.painet_potential import PainetPotential
 from surrogate.models.propagator import Molecule
 from surrogate.models.weights import TrainingDomain, Weights, load_weights, provenance_of, read_header, save_weights
 from surrogate.training import loop

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from surrogate.models.architecture import weights_path
-from surrogate.models.painet.potential import PainetPotential
+from surrogate.models.painet.painet_potential import PainetPotential
 from surrogate.models.potential import RigidBonds
 from surrogate.models.propagator import Molecule
 from surrogate.models.weights import load_weights

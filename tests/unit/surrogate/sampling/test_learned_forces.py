@@ -16,7 +16,7 @@ from surrogate.comparison.read.ensemble import load_ensemble
 from surrogate.models.architecture import weights_path
 from surrogate.models.painet.energy import PotentialConfig
 from surrogate.models.painet.model import Painet, PainetConfig
-from surrogate.models.painet.potential import PainetPotential
+from surrogate.models.painet.painet_potential import PainetPotential
 from surrogate.models.weights import TrainingDomain, Weights, load_weights
 from surrogate.sampling import runner
 from surrogate.sampling.domain import in_bath

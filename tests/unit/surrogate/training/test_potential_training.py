@@ -149,7 +149,7 @@ def test_a_budget_is_for_all_that_a_training_takes(tmp_path: Path, monkeypatch: 
 
 def test_where_members_differ_is_where_the_model_knows_least(tmp_path: Path) -> None:
     reference = Springs()
-    from surrogate.models.painet.potential import PainetPotential
+    from surrogate.models.painet.painet_potential import PainetPotential
 
     torch.manual_seed(0)
     learner = Learner(PainetPotential(SMALL), reference, QUICK, tmp_path / "w.safetensors", resume=False)
@@ -190,7 +190,7 @@ def test_an_interrupted_training_goes_on(tmp_path: Path) -> None:
 
 
 def test_samples_alone_are_enough_to_go_on_from(tmp_path: Path) -> None:
-    from surrogate.models.painet.potential import PainetPotential
+    from surrogate.models.painet.painet_potential import PainetPotential
 
     reference, models = Springs(), [PainetPotential(SMALL) for _ in range(2)]
     for model, resume in zip(models, (False, True), strict=True):
@@ -261,7 +261,7 @@ def test_a_small_molecule_may_turn_about_its_centre_of_mass_but_not_leave() -> N
 def test_states_that_a_pause_let_miss_their_time_are_asked_for_once(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, share: float, asked: bool
 ) -> None:
-    from surrogate.models.painet.potential import PainetPotential
+    from surrogate.models.painet.painet_potential import PainetPotential
 
     reference = Springs()
     learner = Learner(PainetPotential(SMALL), reference, QUICK, tmp_path / "w.safetensors", resume=False)

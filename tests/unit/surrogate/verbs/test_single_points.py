@@ -12,7 +12,7 @@ from md_reference.forces.quantum import Potential
 from md_reference.run.machine import available_cores
 from surrogate.comparison.read.ensemble import Ensemble
 from surrogate.models.architecture import shipped_weights
-from surrogate.models.painet.potential import PainetPotential
+from surrogate.models.painet.painet_potential import PainetPotential
 from surrogate.models.propagator import Molecule
 from surrogate.models.weights import Weights, load_weights
 from surrogate.verbs.run import single_points
