@@ -151,7 +151,7 @@ class Potential(Propagator):
     """
 
     config: Any
-    _rest: tuple[int, Tensor, Tensor] | None = None
+    _rest: tuple[tuple[int, int], list[Tensor], Tensor] | None = None
 
     @abstractmethod
     def energies(self, positions_nm: Tensor, molecule: Molecule) -> Tensor:
@@ -208,8 +208,9 @@ class Potential(Propagator):
 
     def _minimum_nm(self, positions_nm: Tensor, molecule: Molecule) -> Tensor:
         """Return the nearest minimum `(n_atoms, 3)` nm. The last is kept: a scene is asked for several times."""
-        version = sum(p._version for p in self.parameters())
-        if self._rest is None or self._rest[0] != version or not torch.equal(self._rest[1], positions_nm):
+        asked = sum(p._version for p in self.parameters()), int(molecule.charge)
+        of = [positions_nm, molecule.elements, molecule.bonds]
+        if self._rest is None or self._rest[0] != asked or not all(map(torch.equal, self._rest[1], of)):
             # torch's own L-BFGS takes two seconds to import what it compiles with.
             from scipy.optimize import minimize
 
@@ -221,7 +222,7 @@ class Potential(Propagator):
 
             found = minimize(energy, positions_nm.numpy().ravel(), jac=True, method="L-BFGS-B",
                              options={"maxiter": _RELAXED_ROUNDS})  # fmt: skip
-            self._rest = version, positions_nm, torch.from_numpy(found.x).view(-1, 3)
+            self._rest = asked, of, torch.from_numpy(found.x).view(-1, 3)
         return self._rest[2]
 
     def noise_shape(self, n_atoms: int) -> tuple[int, ...]:

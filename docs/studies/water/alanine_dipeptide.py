@@ -4,7 +4,7 @@
     python docs/studies/water/alanine_dipeptide.py openmm FOLDER --time 20ns --replicas 3
     python docs/studies/water/alanine_dipeptide.py simd FOLDER --time 60ns
     python docs/studies/water/alanine_dipeptide.py simd FOLDER --time 60ns --padding 3.3nm    # twice the cell's width
-    python docs/studies/water/alanine_dipeptide.py table FOLDER -o TABLE    # simd_r*.h5, supercell.py's solute_r*.h5
+    python docs/studies/water/alanine_dipeptide.py table FOLDER    # simd_r*.h5, supercell.py's solute_r*.h5
 
 A run that was stopped goes on. `table` leaves out the first 200 ps of each replica: share of psi in the alpha basin
 (-120 to 80 degrees), the integral of the autocorrelation of cos psi and cos phi up to where it falls below 0.05, and
@@ -132,7 +132,7 @@ def main() -> None:
     parser.add_argument("--time", default="20ns")
     parser.add_argument("--replicas", type=int, default=0, help="0: 3 by OpenMM, a batch by SIMD")
     parser.add_argument("--padding", help="distance between images, in a cell of its own at the volume of 1 bar")
-    parser.add_argument("-o", "--out", type=Path)
+    parser.add_argument("-o", "--out", type=Path, default=Path("docs/results/tables/water_alanine_dipeptide.json"))
     args = parser.parse_args()
     if args.what == "table":
         make_table(args.folder, args.out)
