@@ -47,6 +47,8 @@ _AIM = 0.97
 RESTART_S, LEAST_MD_S = 2.0, 8.0
 # Of a run; no stage of MD spends more of its length on coming to equilibrium.
 _EQUILIBRATION_SHARE = 0.1
+# Of a population that nothing is known of.
+_MOST_ERROR = 0.5
 # Below this a potential has no time to learn from as many states as it needs.
 LEAST_TRAINING_S = 240.0
 # The report's share of a budget, and processor seconds that it takes at all, of an atom, and of an atom in a frame.
@@ -172,8 +174,11 @@ def _choose(rates: Rates, budget_s: float, way: str) -> tuple[Way, tuple[str, ..
         best = min(error for name, error in errors.items() if "rollout" in name)
         by_md = errors["MD from many starts"]
         pays = best < by_md or (rates.expensive and best == by_md)  # where neither comes to anything
-        said = ", ".join(f"{100 * error:.2g} % by {name}" for name, error in errors.items())
-        why = (rates.coverage, f"error to expect of a population: {said}, with {rates.relaxation_words}")
+        by_each = ", ".join(f"{100 * error:.2g} % by {name}" for name, error in errors.items())
+        said = f"error to expect of a population: {by_each}, with {rates.relaxation_words}"
+        if min(errors.values()) >= _MOST_ERROR:
+            said = f"no way is sure to see enough with {rates.relaxation_words}; a rollout sees most of it"
+        why = (rates.coverage, said)
         return "rollout" if pays or way == "surrogate" else "md", why
     none = f"no weights: {rates.coverage}"
     if rates.expensive and rates.in_water:
@@ -222,7 +227,7 @@ def expected_errors(
     def error(ps_per_s: float, replicas: int, share: float, start: float) -> float:
         total_ps = max(ps_per_s * share * seconds, 1e-9)
         t = total_ps / replicas / relaxation_ps
-        return min(0.5, math.hypot(math.sqrt(0.5 * relaxation_ps / total_ps), start * -math.expm1(-t) / t))
+        return min(_MOST_ERROR, math.hypot(math.sqrt(0.5 * relaxation_ps / total_ps), start * -math.expm1(-t) / t))
 
     def by_md(share: float, start: float) -> float:
         return error(rates.md_ps_per_s, rates.replicas, share, start)

@@ -311,7 +311,7 @@ def outcome(
     evaluated = comparison.evaluations[0]
     held = [comparison.reference, *([] if comparison.replicate is None else [comparison.replicate])]
     found = None
-    if evaluated.equivalent_time_words and not by_itself:
+    if evaluated.equivalent_time_words:
         found = next((each for each in evaluated.equivalent_time if each.kind == "distribution"), None)
     rolled, speed_up = _length([evaluated.summary]), None
     said = f"{rolled} of the surrogate" if way != "md" else f"{rolled} of MD, evaluated by {_length(held)}"
@@ -469,6 +469,14 @@ def _compared(held: list[Path], candidate: list[Path], label: str) -> Comparison
     return compare(ref, [candidate], replicate=other, labels=[label])
 
 
+def among_themselves(comparison: Comparison) -> Comparison:
+    """Return a comparison of replicas of one rollout without what only MD could tell: no time of MD, no speed-up."""
+    (found,) = comparison.evaluations
+    verdict = f"Replicas of one rollout compared with each other, not with reference MD: {found.status}."
+    found = replace(found, verdict=verdict, equivalent_time=(), equivalent_time_words="", speed_ratio=None)
+    return replace(comparison, evaluations=(found,))
+
+
 def _report(site: Site, record: RunRecord) -> RunRecord:
     from surrogate.comparison.report.figures import weighted_maps
     from surrogate.comparison.report.report import Foreword, write_report
@@ -492,7 +500,7 @@ def _report(site: Site, record: RunRecord) -> RunRecord:
             notes = (*notes, f"MD is not compared with: {error}")
     by_itself = comparison is None
     if comparison is None:
-        comparison = _compared(rolled[: len(rolled) // 2], rolled[len(rolled) // 2 :], label)
+        comparison = among_themselves(_compared(rolled[: len(rolled) // 2], rolled[len(rolled) // 2 :], label))
     held_ps = comparison.reference.total_ps + (comparison.replicate.total_ps if comparison.replicate else 0.0)
     costs = costs_of(record, comparison, held_ps)
     found = outcome(decision.way, comparison, costs, answer, notes, by_itself=by_itself)

@@ -139,6 +139,9 @@ def test_where_forces_are_expensive_energies_of_frames_take_the_place_of_md_that
         found.seconds("rollout") == pytest.approx(7.0 / 3.0 * found.seconds("energies")) and found.equilibrate_ps == 0.0
     )
     assert "reference's energies weigh" in table(covered, found, 60.0)["way"]
+    assert "%" not in found.why[1] and "no way is sure to see enough with a slowest relaxation of 1 ns" in found.why[1]
+    known = replace(covered, rolls=Rolls("drug-like-gfn2-xtb", 0.1, 100.0, 32, relaxation_ps=5.0))
+    assert "a rollout alone" in decide(known, 60.0).why[1], "control"
     slow = replace(covered, rolls=Rolls("drug-like-gfn2-xtb", 0.1, 10.0, 32))
     assert decide(slow, 600.0).seconds("report") < 0.5 * decide(COVERED, 600.0).seconds("report"), "few frames to read"
     longer = decide(covered, 3600.0)

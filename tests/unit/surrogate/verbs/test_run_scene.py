@@ -194,7 +194,9 @@ def test_at_quantum_level_the_answer_is_a_rollout_reweighted_by_the_reference(tm
     found = api.run("smiles:OCCO", folder, level="gfn2-xtb", budget_s=45.0, quiet=True)
     assert [stage["name"] for stage in found["stages"]] == ["rollout", "energies", "report"]
     assert found.answer["populations_by"] == "reweighting" and found.answer["energies"][0] > 50
-    assert found.answer["in_short"][0] in (folder / "report.html").read_text("utf-8") and not found["held_out"]
+    page = (folder / "report.html").read_text("utf-8")
+    assert found.answer["in_short"][0] in page and not found["held_out"]
+    assert "compared with each other, not with reference MD" in page and "× the reference" not in page
     weights = np.concatenate([frame_weights(path) for path in found.trajectory])
     asked = len((folder / "energies.csv").read_text().splitlines()) - 1
     assert 0 < np.count_nonzero(weights) <= asked and weights.mean() == pytest.approx(1.0)
