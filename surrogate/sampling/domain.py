@@ -397,7 +397,7 @@ def choose_weights(
     `conditions`: force field and solvent that they must have been trained under, if any. Raises OutOfDomainError, which
     says what the nearest lack, when none covers the scene.
     """
-    found, refusals, levels = [], [], {}
+    found, refusals, levels, loaded = [], [], {}, {}
     for name, path in shipped_weights().items():
         header = read_header(path)
         arch = architecture(header.arch)
@@ -417,7 +417,8 @@ def choose_weights(
             check_conditions(header.domain.conditions, conditions or {}, path.name)
             apart = False
             if general:  # by MD: last
-                match_domain(scene, load_weights(path), temperature_k=temperature_k)
+                loaded[name] = load_weights(path)
+                match_domain(scene, loaded[name], temperature_k=temperature_k)
         except OutOfDomainError as error:
             n_reasons = 0 if general else len(error.args[0].split("; "))
             refusals.append((*((False, 0) if apart else (not error.forcible, n_reasons)), name, error))
@@ -434,7 +435,8 @@ def choose_weights(
     others = sorted(other for other, level in levels.items() if other != name and level == levels[name])
     why = "they cover it without having seen it" if unseen else "they were trained on this molecule"
     beside = f"; {', '.join(others)} would do, too" if others else ""
-    return load_weights(path), f"weights not named, taken are the shipped {name}: {why}{beside}"
+    # Those that were asked know the molecule's minimum.
+    return loaded.get(name) or load_weights(path), f"weights not named, taken are the shipped {name}: {why}{beside}"
 
 
 def check_conditions(known: Mapping[str, Any], asked: Mapping[str, Any], name: str) -> None:
