@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
+from itertools import count
 from typing import Any
 
 import numpy as np
@@ -25,6 +26,7 @@ from systems.chemistry.graph import rotatable_torsions
 from systems.chemistry.validity import CHIRALITY, NOT_FINITE, OMEGA, RING, check_frames, geometry_from_scene
 from systems.errors import PreparationError, SimulationError
 from systems.interrupts import stop_if_asked
+from systems.prepare.ring_conformers import conformer_of, ring_conformers
 from systems.scene import FloatArray, IntArray, Scene, part_of
 
 HOT_K, HOT_PS, FRICTION_PER_PS = 500.0, 100.0, 5.0
@@ -42,9 +44,10 @@ _KEPT = NOT_FINITE | CHIRALITY | OMEGA | RING
 def many_starts(scene: Scene, conditions: Conditions, n: int, *, hot_ps: float = HOT_PS) -> Starts:
     """Return `n` starts of a scene in different states, drawn with the seed of `conditions`, and how they were found.
 
-    They come from `hot_ps` at 500 K and a fifth of that at the bath's temperature, by SIMD replicas where these run the
-    scene, else by OpenMM; at quantum level by GAFF2. In explicit water the solute is turned to the torsions that its
-    dry self then has. Where nothing turns, or hot MD fails, all begin in the scene's own structure, and `how` says so.
+    They come from `hot_ps` at 500 K, of the structure given and of conformers whose rings pucker differently, and a
+    fifth of that at the bath's temperature, by SIMD replicas where these run the scene, else by OpenMM; at quantum
+    level by GAFF2. In explicit water the solute is turned to the torsions that its dry self then has. Where nothing
+    turns, or hot MD fails, all begin in the scene's own structure, and `how` says so.
     """
 
     def one(why: str) -> Starts:
@@ -54,13 +57,14 @@ def many_starts(scene: Scene, conditions: Conditions, n: int, *, hot_ps: float =
         return one("one replica" if n == 1 else "a model system")
     solute = solute_of(scene) if scene.cell_nm is not None else np.arange(scene.n_atoms)
     dry = scene if len(solute) == scene.n_atoms and scene.cell_nm is None else part_of(scene, solute)
-    if not len(rotatable_torsions(dry)):
+    conformers = ring_conformers(dry)
+    if len(conformers) == 1 and not len(rotatable_torsions(dry)):
         return one("no torsion turns")
     if scene.cell_nm is not None:
         dry = replace(dry, cell_nm=None)
     try:
         spec = _hot_forces(conditions.force)
-        frames, by = _hot(dry, replace(conditions, force=spec, ensemble="nvt"), n, hot_ps)
+        frames, by = _hot(dry, conformers, replace(conditions, force=spec, ensemble="nvt"), n, hot_ps)
         if scene.cell_nm is not None:
             frames = _in_water(
                 scene, conditions, dry, np.asarray(torsion(frames, rotatable_torsions(dry)), dtype=np.float64)
@@ -68,6 +72,8 @@ def many_starts(scene: Scene, conditions: Conditions, n: int, *, hot_ps: float =
     except (PreparationError, SimulationError) as error:
         return one(str(error).rstrip("."))
     how = f"{n} starts: the structure given and, {by}, states after {hot_ps:.3g} ps at {HOT_K:g} K"
+    if len(conformers) > 1:
+        how += f" of {len(conformers)} ring conformers"
     return _scenes(scene, frames), how + (", cooled" if scene.cell_nm is None else ", turned to in water")
 
 
@@ -111,22 +117,27 @@ def _hot_forces(force: ForceFieldSpec) -> ForceFieldSpec:
     return force
 
 
-def _hot(dry: Scene, conditions: Conditions, n: int, hot_ps: float) -> tuple[FloatArray, str]:
+def _hot(
+    dry: Scene, conformers: FloatArray, conditions: Conditions, n: int, hot_ps: float
+) -> tuple[FloatArray, str]:  # fmt: skip
     """Return frames `(n, n_atoms, 3)`, the first as given and minimised, the others from hot MD; and by what."""
     system = build_system(dry, conditions.force)
     on_cpu = replace(conditions, platform="Reference" if dry.n_atoms < 300 else "CPU")
     with Engine(dry, on_cpu, threads=1, system=system) as engine:
-        engine.minimise()
-        start = engine.positions()
+        bases = []
+        for conformer in conformers:
+            engine.set_positions(conformer)
+            engine.minimise()
+            bases.append(engine.positions())
     geometry = geometry_from_scene(dry)
     try:
-        batches, by = _by_simd(system, conditions, start, hot_ps), "by SIMD replicas"
+        batches, by = _by_simd(system, conditions, bases, hot_ps), "by SIMD replicas"
         batch = next(batches)
     except SimdUnavailableError:
-        batches, by = _by_openmm(dry, system, on_cpu, start, hot_ps), "by OpenMM"
+        batches, by = _by_openmm(dry, system, on_cpu, bases, hot_ps), "by OpenMM"
         batch = next(batches)
-    found = [start]
-    for _ in range(2 + 4 * n // n_replicas()):
+    found = [bases[0]]
+    for _ in range(2 + 4 * n // len(batch)):
         found += [x for x in batch if not check_frames(x, geometry)[0] & _KEPT]
         if len(found) >= n:
             break
@@ -135,15 +146,16 @@ def _hot(dry: Scene, conditions: Conditions, n: int, hot_ps: float) -> tuple[Flo
     return np.stack([found[k % len(found)] for k in range(n)]), by
 
 
-def _by_simd(system: Any, conditions: Conditions, start: FloatArray, hot_ps: float) -> Iterator[FloatArray]:
+def _by_simd(system: Any, conditions: Conditions, bases: list[FloatArray], hot_ps: float) -> Iterator[FloatArray]:
     """Yield batches of sixteen states that were hot and have cooled down."""
     how: dict[str, Any] = {"friction_per_ps": FRICTION_PER_PS, "timestep_ps": conditions.timestep_ps}
-    at = start[None]
+    # The first replica of all is the structure given.
+    at = np.stack([bases[conformer_of(k + 1, len(bases))] for k in range(n_replicas())])
     seed = conditions.seed
     while True:
         for temperature_k, time_ps in ((HOT_K, hot_ps), (conditions.temperature_k, _COOLING * hot_ps)):
             run = SimdReplicas(system, temperature_k=temperature_k, seed=seed % 2**31, **how)
-            run.set_positions(np.repeat(start[None], run.n_replicas, axis=0) if len(at) == 1 else at)
+            run.set_positions(at)
             run.thermalise()
             _steps(run, time_ps)
             at, seed = run.positions_nm.astype(np.float64), seed + 7919
@@ -152,21 +164,21 @@ def _by_simd(system: Any, conditions: Conditions, start: FloatArray, hot_ps: flo
 
 
 def _by_openmm(
-    scene: Scene, system: Any, conditions: Conditions, start: FloatArray, hot_ps: float
+    scene: Scene, system: Any, conditions: Conditions, bases: list[FloatArray], hot_ps: float
 ) -> Iterator[FloatArray]:
-    """Yield states of one hot run, each minimised, which cooling would do."""
+    """Yield states of hot runs, one of each conformer, each minimised, which cooling would do."""
     hot = replace(conditions, temperature_k=HOT_K, friction_per_ps=FRICTION_PER_PS)
     with Engine(scene, hot, threads=1, system=system) as engine:
-        engine.set_positions(start)
-        engine.thermalise()
-        while True:
+        kept = list(bases)
+        for k in count(1):
             stop_if_asked()
+            own = conformer_of(k, len(bases))
+            engine.set_positions(kept[own])
+            engine.thermalise()
             engine.step(max(1, round(_APART * hot_ps / hot.timestep_ps)))
-            kept = engine.positions()
+            kept[own] = engine.positions()
             engine.minimise(max_iterations=200)
             yield engine.positions()[None]
-            engine.set_positions(kept)
-            engine.thermalise()
 
 
 def _in_water(wet: Scene, conditions: Conditions, dry: Scene, angles: FloatArray) -> FloatArray:

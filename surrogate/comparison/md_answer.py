@@ -8,6 +8,7 @@ a learned potential serve as well, where the energies of its reference say how m
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -33,6 +34,8 @@ from systems.units import GAS_CONSTANT_KJ_MOL_K, format_time_ps
 _TICA_LAG_PS = 10.0
 _DIMENSIONS, _MICROSTATES, _FRAMES_A_MICROSTATE = 8, 100, 50
 _MAP_BINS = 36
+# Torsions that have states: of a ring its pucker.
+_KINDS = (*SLOW_KINDS, "ring")
 # Shares are given no smaller error than counting leaves, and differ when they are so many errors apart.
 _APART, _LEAST_APART = 2.5, 0.02
 # Few transitions tell too small an error: of MD that has not converged a difference is no contradiction before this.
@@ -123,7 +126,14 @@ class Answer:
     @property
     def is_sure(self) -> bool:
         """Whether its tests hold, and transitions connect more than one of the states that were visited."""
-        return self.holds and bool(self.timescales_ps or not self.missing)
+        return self.holds and bool(self._weighed if self.states else self.timescales_ps or not self.missing)
+
+    @property
+    def _weighed(self) -> list[StateEnergy]:
+        """The states that have weights, of torsions that have two or more of these."""
+        known = [s for s in self.states if not s.missing]
+        several = {t for t, n in Counter(s.torsion for s in known).items() if n > 1}
+        return [s for s in known if s.torsion in several]
 
     @property
     def is_by_surrogate(self) -> bool:
@@ -139,13 +149,13 @@ class Answer:
     @property
     def in_short(self) -> tuple[str, str, str]:
         """Three lines: whether to use it, for what and what is missing, why."""
-        weighted = [s for s in self.states if not s.missing]
+        weighted = self._weighed
         if self.is_by_surrogate:
             use = "Use the surrogate's populations for now, not MD's."
             what = f"For {len(weighted)} states, to about {100 * MODEL_ERROR:.0f} % (assumed); "
             what += "MD does not contradict them."
         elif not self.states and self.holds:
-            use, what = f"Use {self.whose} frames.", "For the distribution of all torsions: each has a single state."
+            use, what = f"Use {self.whose} frames.", "For all distributions: no torsion has two states to weigh."
         elif not self.is_sure:
             what, shown = "No torsion has two states.", "frames"
             if n := len(self.states):
@@ -237,7 +247,7 @@ class _Torsions:
     def __init__(self, ensemble: Ensemble) -> None:
         scene = ensemble.scene
         self.backbone: Backbone = backbone(scene)
-        self.others: list[Torsion] = [t for t in find_torsions(scene) if t.kind in SLOW_KINDS]
+        self.others: list[Torsion] = [t for t in find_torsions(scene) if t.kind in _KINDS]
         rows = [self.backbone.phi, self.backbone.psi, np.array([t.quad for t in self.others]).reshape(-1, 4)]
         self.quads = np.concatenate([np.asarray(r, dtype=np.int64).reshape(-1, 4) for r in rows])
         self.fold = np.array([1] * (len(rows[0]) + len(rows[1])) + [t.fold for t in self.others])
@@ -282,10 +292,11 @@ def md_answer(
     `md`: one segment a replica; `temperature_k` of its bath; `factors`: what each frame counts at the law of a
     reference, exp(-(U_reference - U_model) / kT) up to a constant, NaN where the reference was not asked. Of a small
     molecule that is its own mirror image each replica counts with its mirror image, as long as MD connects the two.
-    Raises InputError where no torsion of the molecule turns or replicas are too short to tell anything.
+    Raises InputError where no torsion of the molecule turns, so that MD has nothing to weigh, or replicas are too short
+    to tell anything.
     """
     torsions = _Torsions(md)
-    if not len(torsions.quads):
+    if not len(torsions.quads) and factors is None:
         raise InputError(f"{md.scene.name}: no torsion turns, and so there are no states to weigh.")
     of_md = torsions.of(md)
     for angles in ([*of_md, *(-a for a in of_md)], of_md) if torsions.has_images else (of_md,):
@@ -383,7 +394,9 @@ def _tests(found: Equilibrium, ps: float) -> str:
 
 
 def _microstates(angles: list[FloatArray], lag_ps: float) -> list[IntArray]:
-    """Return the microstate of every frame: k-means in the slow space of the torsions."""
+    """Return the microstate of every frame: k-means in the slow space of the torsions, one where there are none."""
+    if not angles[0].shape[1]:
+        return [np.zeros(len(a), dtype=np.int64) for a in angles]
     features = [kinetics.circular_features(a) for a in angles]
     shortest = min(map(len, features))
     lag = max(1, min(round(_TICA_LAG_PS / lag_ps), shortest // 4))

@@ -36,6 +36,7 @@ from systems.errors import InputError, SimulationError, first_line
 from systems.files.outside import UNREADABLE, arrays_in, check_disk
 from systems.files.schema import built
 from systems.interrupts import deferred_interrupt
+from systems.prepare.ring_conformers import conformer_of, ring_conformers
 from systems.scene import Scene, part_of, select_atoms
 from systems.trajectory import checkpoint
 from systems.trajectory.base import TrajectoryWriter
@@ -421,10 +422,13 @@ def rollout(
 
 
 def _start(plan: Plan, sampler: ChunkSampler, n_replicas: int, asked_to_stop: Callable[[], bool]) -> Progress:
-    positions = plan.scene.positions_nm - plan.scene.positions_nm.mean(axis=0)
-    start = positions.astype(np.float32)[plan.match.order]
-    frames = np.broadcast_to(start, (n_replicas, sampler.n_conditioning, *start.shape)).copy()
     began = time.monotonic()
+    positions = plan.scene.positions_nm[None]
+    if plan.config.anneal_ps and not plan.match.seen:  # heat turns torsions, and no chair
+        positions = ring_conformers(plan.scene)
+    starts = (positions - positions.mean(axis=1, keepdims=True)).astype(np.float32)[:, plan.match.order]
+    own = starts[[conformer_of(k, len(starts)) for k in range(n_replicas)]]
+    frames = np.repeat(own[:, None], sampler.n_conditioning, axis=1)
     if plan.config.anneal_ps:
         frames = _annealed(plan, sampler, frames, asked_to_stop)
     return Progress(frames, wall_s=time.monotonic() - began, tallies=[Tally() for _ in range(n_replicas)])

@@ -326,6 +326,13 @@ def embed(molecule: Any, *, seed: int, notes: list[str]) -> Any:
     from rdkit.Chem import rdDistGeom
     from rdkit.Chem import rdForceFieldHelpers as force_fields
 
+    def embedded() -> bool:
+        try:
+            return bool(rdDistGeom.EmbedMolecule(out, parameters) == 0)
+        except RuntimeError:  # an invariant violation, with these torsions of cyclopentane
+            parameters.useSmallRingTorsions = False
+            return bool(rdDistGeom.EmbedMolecule(out, parameters) == 0)
+
     out = Chem.Mol(molecule)
     parameters: Any = rdDistGeom.ETKDGv3()
     parameters.useSmallRingTorsions = True
@@ -335,7 +342,7 @@ def embed(molecule: Any, *, seed: int, notes: list[str]) -> Any:
         for random_start in (False, True):
             parameters.useRandomCoords = random_start
             with rdBase.BlockLogs():
-                if rdDistGeom.EmbedMolecule(out, parameters) == 0:
+                if embedded():
                     break
         else:
             raise PreparationError(

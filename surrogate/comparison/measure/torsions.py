@@ -11,6 +11,7 @@ import networkx as nx
 import numpy as np
 
 from surrogate.comparison.measure.statistics import FloatArray, IntArray, Segments
+from systems.chemistry.geometry import torsion
 from systems.chemistry.graph import atom_classes, backbone_torsions, bonded_graph, rotatable_torsions
 from systems.chemistry.validity import small_rings
 from systems.scene import Scene
@@ -19,6 +20,7 @@ Kind = Literal["ω", "χ", "rotatable", "rotor", "ring"]
 Quad = tuple[int, int, int, int]
 
 _FLAT = 0.25
+_NEARLY = 0.8
 _BINS = 72
 # Peaks of an angle are two states where the density between them falls below this share of the lower one.
 _SADDLE = 0.5
@@ -61,10 +63,20 @@ def find_torsions(scene: Scene) -> list[Torsion]:
     for ring in small_rings(scene):
         # Without hydrogens valence does not show; the torsion of a flat ring stays where it is.
         if "H" not in scene.elements or any(graph.degree(i) == 4 for i in ring):
-            start = ring.index(min(ring))
-            a, b, c, d = [*ring[start:], *ring[:start]][:4]
+            a, b, c, d = _puckered(scene, ring)
             found.append(Torsion((a, b, c, d), f"ring {bond_label(scene, b, c)}", "ring", 1))
     return found
+
+
+def _puckered(scene: Scene, ring: list[int]) -> Quad:
+    """Return a torsion of a ring that its pucker turns: the first, from the lowest atom on, that is nearly as far from
+    flat as any. The one about a half chair's double bond stays at zero."""
+    start = ring.index(min(ring))
+    around = [*ring[start:], *ring[:start]] * 2
+    quads = [(around[k], around[k + 1], around[k + 2], around[k + 3]) for k in range(len(ring))]
+    angles = np.abs(np.asarray(torsion(scene.positions_nm[None], np.array(quads)))[0])
+    bent = np.minimum(angles, np.pi - angles)
+    return quads[int(np.argmax(bent >= _NEARLY * bent.max()))]
 
 
 def _chi_torsions(scene: Scene) -> dict[frozenset[int], tuple[Quad, str]]:

@@ -450,7 +450,7 @@ def answer_of(site: Site, record: RunRecord) -> Answer | None:
 
 
 def _reweighted(site: Site, rolled: Ensemble) -> Answer | None:
-    """Return what a rollout says at the law of its reference; None where that was not asked, or no torsion turns."""
+    """Return what a rollout says at the law of its reference; None where that was not asked, or it is too short."""
     from surrogate.verbs.run.single_points import differences, factors_of
 
     known = differences(site.folder, rolled.segment_lengths)
@@ -469,11 +469,20 @@ def _compared(held: list[Path], candidate: list[Path], label: str) -> Comparison
     return compare(ref, [candidate], replicate=other, labels=[label])
 
 
+_NOTHING_KNOWN = (
+    "Not known yet whether it can be used.",
+    "For nothing yet: there is no MD to compare it with.",
+    "Why: too few frames, or too few energies of its reference, to weigh any state; a longer `budget` gives more.",
+)
+
+
 def among_themselves(comparison: Comparison) -> Comparison:
     """Return a comparison of replicas of one rollout without what only MD could tell: no time of MD, no speed-up."""
     (found,) = comparison.evaluations
     verdict = f"Replicas of one rollout compared with each other, not with reference MD: {found.status}."
     found = replace(found, verdict=verdict, equivalent_time=(), equivalent_time_words="", speed_ratio=None)
+    if found.status != "broken":
+        found = replace(found, in_short=_NOTHING_KNOWN)
     return replace(comparison, evaluations=(found,))
 
 

@@ -63,6 +63,28 @@ def test_without_simd_openmm_heats(monkeypatch: pytest.MonkeyPatch) -> None:
     assert np.abs(angles(scenes)[1:] - angles(scenes)[0]).max() > 0.1
 
 
+@pytest.mark.parametrize("by_simd", [True, False])
+def test_replicas_begin_in_either_chair(monkeypatch: pytest.MonkeyPatch, by_simd: bool) -> None:
+    from systems.library.named_scenes import prepare
+
+    def unavailable(*_: object, **__: object) -> object:
+        raise SimdUnavailableError("no compiler")
+
+    if not by_simd:
+        monkeypatch.setattr(starts, "SimdReplicas", unavailable)
+    scene = prepare("smiles:CC1CCCCC1")
+
+    def n_turned() -> int:
+        scenes, _ = many_starts(scene, conditions(scene), 6, hot_ps=2.0)
+        side = np.sign(torsion(np.stack([s.positions_nm for s in scenes]), np.array([[1, 2, 3, 4]]))[:, 0])
+        return int((side != side[0]).sum())
+
+    assert n_turned() == 2 and "2 ring conformers" in many_starts(scene, conditions(scene), 6, hot_ps=2.0)[1]
+    monkeypatch.setattr(starts, "ring_conformers", lambda scene: scene.positions_nm[None])
+    with pytest.raises(AssertionError):
+        assert n_turned() == 2, "negative control: heat does not turn it"
+
+
 def test_what_cannot_turn_begins_in_one_structure() -> None:
     from systems.library.named_scenes import prepare
 

@@ -17,6 +17,7 @@ from systems.chemistry.graph import backbone_torsions, bonded_graph, turned
 from systems.errors import InputError
 from systems.library.named_scenes import prepare
 from systems.prepare.peptide import build_peptide
+from systems.prepare.ring_conformers import ring_conformers
 
 SCENE = build_peptide("ACE-ALA-NME")
 STATES = {"α": (-70.0, -40.0), "β": (-80.0, 140.0), "left-handed": (55.0, 40.0)}
@@ -274,10 +275,31 @@ def test_what_keeps_its_hand_atom_by_atom(smiles: str, is_own_image: bool) -> No
     assert told._is_its_mirror_image(prepare(f"smiles:{smiles}")) is is_own_image
 
 
+def chairs(n_turned: int) -> Ensemble:
+    """Twelve replicas of methylcyclohexane, so many of them in the other chair than the rest."""
+    scene, rng = prepare("smiles:CC1CCCCC1"), np.random.default_rng(2)
+    forms = ring_conformers(scene)
+    x = np.stack([forms[int(k < n_turned)] for k in range(12)])[:, None].repeat(60, axis=1)
+    return Ensemble("MD", list((x + rng.normal(0, 0.004, x.shape)).astype(np.float32)), 1.0, scene)
+
+
+def test_a_chair_that_never_turns_over_is_not_connected() -> None:
+    answer = md_answer(chairs(4), 300.0)
+    assert len(answer.states) == 2 and all(s.torsion.startswith("ring") for s in answer.states)
+    assert "not connected: ring" in answer.missing[0] and "4 of 12 replicas" in answer.missing[0]
+    assert answer.in_short[0] == "Do not use MD's populations yet." and not answer.is_sure
+    assert "0.0" not in answer.in_short[1], "what one state is alone with is known to no error"
+    assert md_answer(chairs(0), 300.0).is_sure, "control"
+
+
 def test_a_molecule_without_torsions_is_one_line() -> None:
-    water = prepare("smiles:C")
+    methane = prepare("smiles:C")
+    md = Ensemble("MD", [np.repeat(methane.positions_nm[None], 60, 0).astype(np.float32)] * 4, 1.0, methane)
     with pytest.raises(InputError, match="no torsion turns"):
-        md_answer(Ensemble("MD", [np.repeat(water.positions_nm[None], 20, 0).astype(np.float32)], 1.0, water), 300.0)
+        md_answer(md, 300.0)
+    counted = md_answer(md, 300.0, factors=[np.linspace(0.5, 1.5, 60)] * 4)
+    assert counted.in_short[0] == "Use the reweighted frames." and counted.holds
+    np.testing.assert_allclose(np.array(counted.weights), np.linspace(0.5, 1.5, 60)[None].repeat(4, 0), rtol=1e-6)
 
 
 def test_equilibrium_takes_what_no_state_holds() -> None:

@@ -371,3 +371,10 @@ def test_a_methylene_group_that_is_embedded_flat_is_embedded_anew(monkeypatch: p
     assert 105.0 < widest() < 120.0
     monkeypatch.setattr("systems.prepare.molecule._ATTEMPTS", 1)
     assert widest() > 170.0, "control"
+
+
+@pytest.mark.parametrize("smiles", ["C1CCCC1", "CC1CCCC1"])
+def test_cyclopentane_is_embedded_although_rdkit_s_torsions_of_small_rings_fail_on_it(smiles: str) -> None:
+    scene = scene_from_smiles(smiles)
+    lengths = np.linalg.norm(np.diff(scene.positions_nm[scene.bonds], axis=1)[:, 0], axis=1)
+    assert lengths.min() > 0.10 and lengths.max() < 0.16
