@@ -273,6 +273,8 @@ def alike(ensembles: Sequence[Ensemble]) -> tuple[list[Ensemble], IntArray | Non
         out = [e.restricted(np.searchsorted(atoms, common), scene) for e, atoms in zip(out, held, strict=True)]
         note = f"Compared on the {len(common)} atoms that all trajectories hold, of {len(every)}."
         out[0] = replace(out[0], notes=(*out[0].notes, note))
+    if few := [f"{e.label} holds {e.n_frames}" for e in out if e.n_frames < _LEAST_FRAMES]:
+        raise InputError(f"Too few frames to compare: {', '.join(few)}; at least {_LEAST_FRAMES} are needed.")
     strides = _common_strides([e.lag_ps for e in out])
     if any(e.n_frames // stride < _LEAST_FRAMES for e, stride in zip(out, strides, strict=True)):
         intervals = ", ".join(f"{e.label}: {format_time_ps(e.lag_ps)}" for e in out)

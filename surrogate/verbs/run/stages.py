@@ -505,7 +505,7 @@ def _report(site: Site, record: RunRecord) -> RunRecord:
             comparison = _compared(held, rolled, label)
         except InputError as error:
             if not is_reweighted:
-                raise
+                raise InputError(f"{error} `resume=True` with a longer `budget_s` goes on.") from error
             notes = (*notes, f"MD is not compared with: {error}")
     by_itself = comparison is None
     if comparison is None:

@@ -201,6 +201,9 @@ def test_least_common_interval(
 def test_intervals_without_a_common_multiple_are_refused(simulate: Callable[..., Ensemble]) -> None:
     with pytest.raises(InputError, match="no common multiple"):
         alike([simulate(23, 100), replace(simulate(23, 100), lag_ps=0.997)])
+    few = simulate(24, 9)
+    with pytest.raises(InputError, match=f"{few.label} holds 9; at least 10"):
+        alike([simulate(23, 100), few])
 
 
 def test_shapes_are_checked(alanine_dipeptide: Scene) -> None:
