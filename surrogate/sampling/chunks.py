@@ -86,7 +86,7 @@ class ChunkSampler:
         self._fit = fitted_atoms(template)
         self._target = template.positions_nm - template.positions_nm[self._fit].mean(axis=0)
 
-    def at(self, temperature_k: float, n_new: int) -> ChunkSampler:
+    def at(self, temperature_k: float, n_new: int, least_friction_per_ps: float = 0.0) -> ChunkSampler:
         """Return this sampler of a potential at another temperature, in NVT, for chunks of `n_new` frames; in steps
         that are stable at 600 K."""
         other, model = copy.copy(self), cast(Potential, self._model)
@@ -94,7 +94,9 @@ class ChunkSampler:
         step_ps, lag_ps = model.config.timestep_ps, model.config.lag_ps
         if step_ps > _HOT_STEP_PS:
             step_ps = lag_ps / math.ceil(lag_ps / _HOT_STEP_PS - 1e-6)
-        bath = {"temperature_k": temperature_k, "ensemble": "nvt", "n_new": n_new, "timestep_ps": step_ps}
+        friction = max(model.config.friction_per_ps, least_friction_per_ps)
+        bath = {"temperature_k": temperature_k, "ensemble": "nvt", "n_new": n_new, "timestep_ps": step_ps,
+                "friction_per_ps": friction}  # fmt: skip
         other._model = model.in_bath(bath)
         return other
 

@@ -310,6 +310,8 @@ class _Rollout:
 
 # Stages of annealing, of which the first are hot: as hot as the states that potentials learn from.
 HOT_K, HOT_STAGES, ANNEAL_STAGES = 600.0, 3, 10
+# Friction times the length of a stage, at least.
+_COOLINGS = 2.0
 
 # (frames done, frames in all, summary of speed and interventions) of one replica -> None
 ProgressFn = Callable[[int, int, str], None]
@@ -444,7 +446,8 @@ def _annealed(plan: Plan, usual: ChunkSampler, start: npt.NDArray[np.float32],
     n_frames = max(1, round(plan.config.anneal_ps / len(stages) / config.lag_ps))
     chunks = -(-n_frames // config.n_new)
     for stage, temperature_k in enumerate(stages):
-        sampler = usual.at(float(temperature_k), -(-n_frames // chunks))
+        # However short a stage is, it comes to its temperature.
+        sampler = usual.at(float(temperature_k), -(-n_frames // chunks), _COOLINGS / (n_frames * config.lag_ps))
         velocities = None
         for k in range(chunks):
             if asked_to_stop():

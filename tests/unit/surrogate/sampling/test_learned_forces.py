@@ -129,10 +129,10 @@ def test_annealed_replicas_start_all_over(tmp_path: Path, monkeypatch: pytest.Mo
 
     at = runner.ChunkSampler.at
 
-    def at_asked(self: Any, temperature_k: float, n_new: int) -> Any:
+    def at_asked(self: Any, temperature_k: float, n_new: int, friction_per_ps: float) -> Any:
         asked.append(temperature_k)
         frames.append(n_new)
-        found = at(self, temperature_k, n_new)
+        found = at(self, temperature_k, n_new, friction_per_ps)
         # 4 fs is too long where it is hot.
         assert found._model.config.timestep_ps == pytest.approx(0.0025) and self._model.config.timestep_ps == 0.004
         return found
@@ -163,6 +163,25 @@ def test_annealed_replicas_start_all_over(tmp_path: Path, monkeypatch: pytest.Mo
     other = weights(Painet(PainetConfig(n_new=2, width=16)))
     with pytest.raises(InputError, match="learned potentials"):
         rollout(other.domain.scene, other, [tmp_path / "x.h5"], RolloutConfig(time_ps=0.1, anneal_ps=1.0))
+
+
+def test_a_short_annealing_ends_as_cold_as_a_long_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    loaded = load_weights(weights_path("paracetamol-gfn2-xtb"))
+    scene = loaded.domain.scene
+    assert isinstance(loaded.model, PainetPotential)
+    model, molecule = loaded.model, loaded.model.featurise(scene)
+
+    def energy(anneal_ps: float) -> float:
+        outs = [tmp_path / f"{anneal_ps}_r{k}.h5" for k in range(32)]
+        rollout(scene, loaded, outs, RolloutConfig(time_ps=0.1, guard="off", anneal_ps=anneal_ps), overwrite=True)
+        x = torch.tensor(np.stack([open_trajectory(out).read()[0] for out in outs]), dtype=torch.float64)
+        return float(model.evaluate(x, molecule).energy_kj_mol.mean())
+
+    # Of some 45 degrees of freedom, half a kT each: 56 kJ/mol above the minimum, 2 of error.
+    long, short = energy(20.0), energy(1.0)
+    assert abs(short - long) < 10.0
+    monkeypatch.setattr(runner, "_COOLINGS", 0.0)
+    assert energy(1.0) > long + 10.0, "negative control"
 
 
 def test_torsion_moves_turn_what_md_does_not_and_no_frame_is_caught_for_it(tmp_path: Path) -> None:
