@@ -120,6 +120,9 @@ class Convergence:
         """What would tell; empty where it is converged."""
         if self.converged:
             return ""
+        if apart := {s.torsion for s in self.states if s.entries == s.exits == 0 and 0 < s.started < self.n_replicas}:
+            either = ", ".join(sorted(apart)[:_MENTIONED])
+            return f"replicas began on either side of {either}, and none crossed: far longer ones would tell"
         if self.needed_ps is None:
             return "starts spread over all states would tell; longer replicas from the same start may not"
         return f"replicas of {format_time_ps(self.needed_ps, 2)} or more would tell, or starts spread over all states"

@@ -67,7 +67,10 @@ def test_length_is_that_of_replicas_and_what_would_tell_is_longer_ones() -> None
     assert found.length == "32 replicas of 1.8 ns" and "57.6" not in found.verdict
     assert found.needed_ps is not None and found.needed_ps > 5 * found.slowest_ps
     blind = evaluated(Setting("never", 8, 10.0, never=True), 3)
-    assert blind.needed_ps is None and "starts spread" in blind.remedy
+    assert blind.needed_ps is None and "began on either side of ψ THR 2, and none crossed" in blind.remedy
+    # Few crossings of an only run leave it open what other starts would give.
+    few = evaluated(Setting("few", 1, 4.0), 203)
+    assert "starts spread" in few.remedy and "crossed" not in few.remedy
 
 
 def test_what_drifts_explains_a_candidate_ahead_of_it_and_none_behind() -> None:
