@@ -72,6 +72,7 @@ from systems.errors import SimulationError, SurromdError
 from systems.files.whole_file import replica_paths
 from systems.library.named_scenes import prepare
 from systems.scene import ATOMIC_NUMBERS, Scene
+from systems.trajectory.checkpoint import checkpoint_path
 from systems.trajectory.codec import open_trajectory, reweighting
 from systems.units import parse_time_ps, parse_wall_s
 
@@ -419,11 +420,17 @@ def print_effective(given: argparse.Namespace) -> None:
 
 
 def stays_whole(weights: Weights, scene: Scene, time_ps: float, out: Path) -> float:
-    """Return the share of replicas whose frames are all valid after so long. What was stopped goes on."""
+    """Return the share of replicas whose frames are all valid after so long. What was stopped goes on; what a lost
+    replica ended does not."""
+    first = replica_paths(out, REPLICAS)[0]
+    if first.exists() and not checkpoint_path(first).exists():
+        with open_trajectory(first) as reader:
+            if not reader.record["completed"]:
+                return 0.0
     try:
         files = sm.rollout(scene, weights.path, out, time_ps=time_ps, save_every_ps=1.0, guard="flag", force=True,
                            replicas=REPLICAS, seed=SEED, quiet=True,
-                           resume=replica_paths(out, REPLICAS)[0].exists())  # fmt: skip
+                           resume=first.exists())  # fmt: skip
     except SimulationError:
         return 0.0
     whole = 0
