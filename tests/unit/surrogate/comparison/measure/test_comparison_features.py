@@ -182,6 +182,16 @@ def test_small_molecules_have_every_rotatable_torsion() -> None:
     assert kinds["neopentane"] == [("rotor", 3)] * 4
 
 
+@pytest.mark.parametrize("smiles", ["C1=CCCCC1", "COC(=O)[C@H](c1ccccc1Cl)N1CCc2sccc2C1"])
+def test_a_half_chair_is_shown_by_a_torsion_that_its_pucker_turns(smiles: str) -> None:
+    from systems.chemistry.geometry import torsion
+    from systems.library.named_scenes import prepare
+
+    scene = prepare(f"smiles:{smiles}")
+    (ring,) = (t for t in find_torsions(scene) if t.kind == "ring")
+    assert abs(np.degrees(torsion(scene.positions_nm[None], np.array([ring.quad]))[0, 0])) > 40.0
+
+
 def test_rings_that_can_pucker_have_a_torsion(peptide: Scene) -> None:
     (ring,) = (t for t in find_torsions(peptide) if t.kind == "ring")
     assert {peptide.atom_names[i] for i in ring.quad} < {"CA", "CB", "CD", "CG", "N"}, "proline's, not phenyl's"
