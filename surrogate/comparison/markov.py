@@ -36,6 +36,8 @@ _CK_TOLERANCE = 0.05
 # Replicas outlast the slowest process when they are so many times as long; three of these are left out at their start.
 _OUTLASTS, _LEFT_OUT = 20.0, 3.0
 _LEAST_UNITS = 8
+# Of a replica of a rollout that is a prior; a piece holds hardly more than one crossing.
+_PRIOR_PIECES, _LEAST_DRAWN = 32, 0.05
 # Fewer transitions of the slowest process, in its rarer direction, tell no populations.
 _LEAST_CROSSINGS = 5
 # What has fewer frames than this share is not named as missing.
@@ -174,6 +176,64 @@ def equilibrium(
             each = np.where(visits > 0, model.populations / visits, 0.0)
         weights += [np.append(each, 0.0)[m] for m in micro[k : k + own]]
     return replace(found, weights=with_mean_one(weights))
+
+
+def with_prior(
+    found: Equilibrium, micro: Sequence[IntArray], prior: Sequence[IntArray], *, crossings: float, seed: int = 0
+) -> Equilibrium:
+    """Return the equilibrium of MD whose transitions count together with those of a surrogate's rollout.
+
+    `micro`, `prior`: microstates of MD's frames, the same replicas as `found` is of, and of the rollout's, in one
+    numbering. The rollout's counts are scaled so that they are worth so many `crossings` of its slowest process, or
+    fewer where it saw fewer: a Dirichlet prior of transition probabilities. What MD sees often is MD's; what it hardly
+    sees is the surrogate's. Draws resample MD's replicas, and pieces of the rollout with weights of mean and variance
+    of that scale. Segments of the rollout stand behind MD's; their frames count where MD has none. Raises InputError
+    where no model fits.
+    """
+    n, lag = 1 + max(int(m.max()) for m in (*micro, *prior)), found.lag_frames
+    of_md, of_prior = list(found.unit_of), _units(list(prior), lag, _PRIOR_PIECES)
+    by_unit = np.concatenate([_counts(list(m), u, n, lag) for m, u in ((micro, of_md), (prior, of_prior))])
+    seen = _Model(list(prior), of_prior, n, lag).crossings(list(prior), len(prior))
+    scale = min(1.0, crossings / max(seen, 1))
+    rng = np.random.default_rng(seed)
+    drawn = np.maximum(rng.gamma(scale, size=(len(found.resampled), len(of_prior))), _LEAST_DRAWN * scale)
+    multiplicity = np.hstack([found.resampled, drawn])
+    n_md = len(of_md)
+
+    def populations(each: FloatArray) -> FloatArray:
+        md, rolled = (np.tensordot(each[part], by_unit[part], 1) for part in (slice(n_md), slice(n_md, None)))
+        fitted = _fit(_ended(md) + rolled)
+        out = np.zeros(n)
+        if fitted is not None:
+            out[fitted[2]] = fitted[1]
+        return out
+
+    all_units = populations(np.r_[np.ones(len(of_md)), np.full(len(of_prior), scale)])
+    if not all_units.any():
+        raise InputError("no reversible Markov model fits the transitions of MD and of the rollout.")
+    visits = [sum(np.bincount(m[m >= 0], minlength=n) for m in of) for of in (micro, prior)]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        own = np.where(visits[0] > 0, all_units / visits[0], 0.0)
+        other = np.where((visits[0] == 0) & (visits[1] > 0), all_units / visits[1], 0.0)
+    weights = [np.append(of, 0.0)[m] for of, some in ((own, micro), (other, prior)) for m in some]
+    return replace(
+        found, method="Markov model", populations=all_units, draws=np.array([populations(m) for m in multiplicity]),
+        resampled=multiplicity, unit_of=(*of_md, *((len(micro) + k, a, b) for k, a, b in of_prior)),
+        weights=with_mean_one(weights),
+    )  # fmt: skip
+
+
+def _ended(counts: FloatArray) -> FloatArray:
+    """Return MD's counts in which visits that none has ended end once: to states that were entered and never left one
+    count out, in the proportions in which they were entered."""
+    out = counts.copy()
+    labels = _components(counts)
+    for component in np.unique(labels[labels > 0]):
+        inside = labels == component
+        entered = counts[np.ix_(~inside, inside)]
+        if entered.any() and not counts[np.ix_(inside, ~inside)].any():
+            out[np.ix_(inside, ~inside)] = entered.T / entered.sum()
+    return out
 
 
 def with_mean_one(weights: Sequence[FloatArray]) -> tuple[FloatArray, ...]:

@@ -10,13 +10,14 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from surrogate.comparison.markov import Equilibrium, equilibrium, with_mean_one
+from surrogate.comparison.markov import Equilibrium, equilibrium, with_mean_one, with_prior
 from surrogate.comparison.measure import kinetics
 from surrogate.comparison.measure.distributions import is_alpha
 from surrogate.comparison.measure.movie import pick_frames
@@ -40,8 +41,12 @@ _KINDS = (*SLOW_KINDS, "ring")
 _APART, _LEAST_APART = 2.5, 0.02
 # Few transitions tell too small an error: of MD that has not converged a difference is no contradiction before this.
 _CONTRADICTS = 4.0
-# What a surrogate is taken to be off by in the population of a state: weights keep no such number.
+# What a surrogate is taken to be off by in the population of a state: weights keep no such number. So far is off what
+# n crossings either way tell of a state of population 1/2: sqrt(2 / n) / 4.
 MODEL_ERROR = 0.1
+_PRIOR_CROSSINGS = 1.0 / (8.0 * MODEL_ERROR**2)
+# MD that has converged and whose errors are smaller than this share of that needs no surrogate.
+_BY_ITSELF = 0.5
 # Fewer effective frames (Kish) of a rollout that is reweighted tell no populations; where they are a smaller share of
 # those asked for, asking for more does not help.
 _LEAST_EFFECTIVE, _LEAST_SHARE = 50.0, 0.1
@@ -54,7 +59,8 @@ class StateEnergy:
     """A state of one torsion or residue. `share` of equilibrium with its standard `error`; `free_energy_kj_mol` above
     the likeliest state of that torsion, with `free_energy_error`; None where MD gives no weight; `n_replicas` that ever
     were there, `n_begun` there; `surrogate`: the share that the surrogate gives, `surrogate_error` its standard error,
-    None without one; `missing`: what MD does not tell."""
+    None without one; `missing`: what MD does not tell. Where the surrogate was taken in, `md_share` and `md_error` are
+    MD's alone."""
 
     torsion: str
     state: str
@@ -67,18 +73,26 @@ class StateEnergy:
     surrogate: float | None = None
     surrogate_error: float | None = None
     missing: str = ""
+    md_share: float | None = None
+    md_error: float | None = None
+
+    @property
+    def by_md(self) -> tuple[float, float]:
+        """MD's own share and its error."""
+        return (self.share, self.error) if self.md_share is None else (self.md_share, self.md_error or 0.0)
 
     @property
     def differs(self) -> bool:
         """Whether the surrogate's share is outside the errors."""
         return self.is_apart(_APART)
 
-    def is_apart(self, n_errors: float) -> bool:
-        """Whether the surrogate's share is so many errors away."""
+    def is_apart(self, n_errors: float, model_error: float = 0.0) -> bool:
+        """Whether the surrogate's share is so many errors from MD's, a `model_error` of the surrogate included."""
         if self.surrogate is None or self.missing:
             return False
-        error = math.hypot(self.error, self.surrogate_error or 0.0)
-        return abs(self.surrogate - self.share) > max(n_errors * error, _LEAST_APART)
+        share, error = self.by_md
+        error = math.hypot(error, self.surrogate_error or 0.0, model_error)
+        return abs(self.surrogate - share) > max(n_errors * error, _LEAST_APART)
 
 
 @dataclass(frozen=True, eq=False)
@@ -136,24 +150,30 @@ class Answer:
         return [s for s in known if s.torsion in several]
 
     @property
-    def is_by_surrogate(self) -> bool:
-        """Whether the surrogate's populations are the better answer for now: MD's errors are larger than what a
-        surrogate is taken to be off by, and MD contradicts it nowhere."""
+    def is_joint(self) -> bool:
+        """Whether a surrogate's transitions count with MD's."""
+        return any(s.md_share is not None for s in self.states)
+
+    @property
+    def wants_surrogate(self) -> bool:
+        """Whether a surrogate's transitions would make it better: MD has not converged, or has large errors, and
+        contradicts the surrogate nowhere."""
         both = [s for s in self.states if s.surrogate is not None and not s.missing]
-        if not both or self.is_reweighted or any(s.is_apart(_APART if self.is_sure else _CONTRADICTS) for s in both):
+        n_errors = _APART if self.is_sure else _CONTRADICTS
+        if not both or self.is_reweighted or any(s.is_apart(n_errors, MODEL_ERROR) for s in both):
             return False
-        by_md, rolled = (math.sqrt(sum(e * e for e in errors) / len(both))
-                         for errors in ([s.error for s in both], [s.surrogate_error or 0.0 for s in both]))  # fmt: skip
-        return by_md > math.hypot(MODEL_ERROR, rolled)
+        error = math.sqrt(sum(s.error**2 for s in both) / len(both))
+        return not self.is_sure or error > _BY_ITSELF * MODEL_ERROR
 
     @property
     def in_short(self) -> tuple[str, str, str]:
         """Three lines: whether to use it, for what and what is missing, why."""
         weighted = self._weighed
-        if self.is_by_surrogate:
-            use = "Use the surrogate's populations for now, not MD's."
-            what = f"For {len(weighted)} states, to about {100 * MODEL_ERROR:.0f} % (assumed); "
-            what += "MD does not contradict them."
+        widest = 100 * max((s.error for s in weighted), default=0.0)
+        if self.is_joint:
+            use = "Use MD's and the surrogate's populations together, for now."
+            what = f"For {len(weighted)} states, each to {widest:.2g} % or better (one standard error; the surrogate "
+            what += f"is taken to be off by {100 * MODEL_ERROR:.0f} %)."
         elif not self.states and self.holds:
             use, what = f"Use {self.whose} frames.", "For all distributions: no torsion has two states to weigh."
         elif not self.is_sure:
@@ -162,20 +182,19 @@ class Answer:
                 what, shown = f"They show which states there are: {n}.", "populations"
             use = f"Do not use {self.whose} {shown} yet."
         else:
-            widest = 100 * max((s.error for s in weighted), default=0.0)
             use = "Use the reweighted rollout" if self.is_reweighted else "Use MD's answer"
             use += ", but for what it did not connect." if self.missing else "."
             what = f"For populations and free energies of {len(weighted)} states, each to {widest:.2g} % or better"
             what += " (one standard error)" + (", and relaxation times." if self.relaxation_ps else ".")
-        missing = f" Missing: {'; '.join(self.missing)}." if self.missing and not self.is_by_surrogate else ""
+        missing = f" Missing{' in MD' * self.is_joint}: {'; '.join(self.missing)}." if self.missing else ""
         slow = ""
         if self.relaxation_ps:
             error = f" ± {format_time_ps(self.timescale_errors_ps[0], 2)}" if self.timescale_errors_ps else ""
             slow = f"; the slowest process takes {format_time_ps(self.relaxation_ps[0], 2)}{error}"
         length = f"{self.n_replicas} replicas of {format_time_ps(self.replica_ps, 2)}"
         length += ", each with its mirror image" * self.has_images
-        if self.is_by_surrogate:
-            not_yet = f" and off by up to {100 * max(s.error for s in weighted):.2g} %"
+        if self.is_joint:
+            not_yet = f" and by itself off by up to {100 * max(s.by_md[1] for s in weighted):.2g} %"
         else:
             not_yet = (
                 "" if self.is_sure else "; it has not converged" if self.is_reweighted else " and has not converged"
@@ -193,15 +212,15 @@ class Answer:
         weighted = [s for s in self.states if s.surrogate is not None and not s.missing]
         if not weighted:
             return ""
-        off = sorted((s for s in weighted if s.differs), key=lambda s: -abs((s.surrogate or 0.0) - s.share))
+        off = sorted((s for s in weighted if s.differs), key=lambda s: -abs((s.surrogate or 0.0) - s.by_md[0]))
         if not off:
-            widest = max(s.error for s in weighted)
+            widest = max(s.by_md[1] for s in weighted)
             return (
                 f"The surrogate's populations agree with {self._theirs} in all {len(weighted)} states, within errors "
                 f"of up to {100 * widest:.2g} %."
             )
         worst = off[0]
-        instead = f"{100 * (worst.surrogate or 0.0):.3g} % instead of {percent(worst.share, worst.error)}"
+        instead = f"{100 * (worst.surrogate or 0.0):.3g} % instead of {percent(*worst.by_md)}"
         return (
             f"The surrogate's populations differ from {self._theirs} in {len(off)} of {len(weighted)} states, most in "
             f"{worst.torsion} {worst.state}: {instead}."
@@ -214,7 +233,7 @@ class Answer:
         maps = {k: [[x if math.isfinite(x) else None for x in row] for row in m.tolist()] for k, m in self.maps.items()}
         own = {
             "in_short": list(self.in_short),
-            "populations_by": "surrogate" if self.is_by_surrogate else "reweighting" if self.is_reweighted else "MD",
+            "populations_by": "MD and surrogate" if self.is_joint else "reweighting" if self.is_reweighted else "MD",
             "on_surrogate": self.on_surrogate,
             "states": states,
             "maps_kj_mol": maps,
@@ -227,9 +246,12 @@ class Answer:
         """Return the states as lines of a name and a text."""
         lines = []
         for s in self.states:
-            text = s.missing or percent(s.share, s.error)
-            if not s.missing and s.free_energy_kj_mol is not None and s.free_energy_kj_mol > 0.0:
+            told = s.share > 0.0 if s.md_share is not None else not s.missing
+            text = percent(s.share, s.error) if told else s.missing
+            if told and s.free_energy_kj_mol is not None and s.free_energy_kj_mol > 0.0:
                 text += f", {s.free_energy_kj_mol:.1f} ± {s.free_energy_error or 0.0:.1f} kJ/mol"
+            if told and s.md_share is not None:
+                text += f"; MD {s.missing or percent(*s.by_md)}"
             if s.surrogate is not None:
                 text += f"; surrogate {percent(s.surrogate, s.surrogate_error or 0.0)}{', differs' * s.differs}"
             lines.append((f"{s.torsion} {s.state}", text))
@@ -332,7 +354,7 @@ def md_answer(
             if asked[1] < _LEAST_SHARE * asked[0]:
                 why = ", the surrogate is too far off: give one of this molecule (`surromd train`) as `weights`"
             missing.append(f"only {asked[1]:.0f} of {asked[0]} frames are effective{why}")
-    return Answer(
+    answer = Answer(
         method=found.method,
         n_replicas=found.n_own,
         replica_ps=float(np.median([len(m) for m in micro])) * ps,
@@ -349,6 +371,37 @@ def md_answer(
         weights=with_mean_one(weights[: found.n_own]),
         energies=asked,
     )
+    if surrogate is None or own is None or not answer.wants_surrogate or answer.has_images:
+        return answer
+    if not math.isclose(surrogate.lag_ps, ps, rel_tol=1e-6):
+        return answer
+    with suppress(InputError):
+        return _joint(answer, found, (angles, own), named, torsions, temperature_k, seed)
+    return answer
+
+
+def _joint(
+    answer: Answer, found: Equilibrium, angles: tuple[list[FloatArray], list[FloatArray]], named: list[Named],
+    torsions: _Torsions, temperature_k: float, seed: int,
+) -> Answer:  # fmt: skip
+    """Return the answer in which a surrogate's transitions count, too; `angles` and `named` of both. Raises InputError
+    where no model fits."""
+    n = len(angles[0])
+    micro = _microstates(angles[0], answer.lag_ps, angles[1])
+    joint = with_prior(found, micro[:n], micro[n:], crossings=_PRIOR_CROSSINGS, seed=seed)
+    told = {
+        (s.torsion, s.state): s
+        for name, labels, names, rolled in named
+        for s in _energies(joint, micro, (name, names), [*labels, *(rolled or [])], rolled, temperature_k, None)
+    }
+    states = []
+    for own in answer.states:
+        s = told[own.torsion, own.state]
+        states.append(replace(s, missing=own.missing, n_replicas=own.n_replicas, n_begun=own.n_begun,
+                              md_share=own.share, md_error=own.error))  # fmt: skip
+    weights = joint.weights[:n]
+    maps = _maps(torsions, angles[0], weights, temperature_k)
+    return replace(answer, states=tuple(states), maps=maps, weights=with_mean_one(weights))
 
 
 def _reweighted_shares(
@@ -393,17 +446,20 @@ def _tests(found: Equilibrium, ps: float) -> str:
     )
 
 
-def _microstates(angles: list[FloatArray], lag_ps: float) -> list[IntArray]:
-    """Return the microstate of every frame: k-means in the slow space of the torsions, one where there are none."""
+def _microstates(
+    angles: list[FloatArray], lag_ps: float, beside: Sequence[FloatArray] = ()
+) -> list[IntArray]:  # fmt: skip
+    """Return the microstate of every frame: k-means in the slow space of the torsions, one where there are none; of
+    frames `beside` them as well, which are clustered with them."""
     if not angles[0].shape[1]:
-        return [np.zeros(len(a), dtype=np.int64) for a in angles]
+        return [np.zeros(len(a), dtype=np.int64) for a in (*angles, *beside)]
     features = [kinetics.circular_features(a) for a in angles]
     shortest = min(map(len, features))
     lag = max(1, min(round(_TICA_LAG_PS / lag_ps), shortest // 4))
     projection = kinetics.fit_projection(features, lag, _DIMENSIONS, least=0.05)
     if projection is None:
         raise InputError("MD's replicas are too short to tell states apart; give them more time.")
-    coordinates = [projection.project(x) for x in features]
+    coordinates = [projection.project(x) for x in (*features, *(kinetics.circular_features(a) for a in beside))]
     every = np.concatenate([x[np.isfinite(x).all(axis=1)] for x in coordinates])
     n = max(2, min(_MICROSTATES, len(every) // _FRAMES_A_MICROSTATE))
     return kinetics.assign(kinetics.k_means(every, n, 100), coordinates)

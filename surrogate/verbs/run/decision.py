@@ -30,15 +30,18 @@ _MD_BESIDE, _LEAST_MD_PS = 0.3, 50.0
 # MD without a surrogate is compared with itself: it is split by replicas, or by stages if there is one replica.
 PLANS: dict[Way, Plan] = {
     "md": Plan("MD for the whole budget", {"md": 1.0}),
-    "rollout": Plan("a rollout finds the states, MD from its frames weighs them", {"rollout": 0.1, "held-out md": 0.9}),
+    "rollout": Plan("a rollout finds the states, MD from its frames weighs them", {"rollout": 0.5, "held-out md": 0.5}),
     "potential": Plan(
         "a potential that learns from GFN2-xTB finds the states, GFN2-xTB's energies weigh them",
         {"train": 0.6, "rollout": 0.2, "energies": 0.05, "held-out md": 0.15},
     ),
 }
 _BY_STAGES: dict[Stage, float] = {"md": 0.5, "held-out md": 0.5}
-# Where MD cannot come as near in its time as the rollout does, it only tests that, in no less than half of it.
-_MOST_ROLLED = 0.5
+# Of the time of both a rollout has that share of these by which they err least together.
+_ROLLED = (0.1, 0.2, 0.3, 0.4, 0.5)
+_TOGETHER = "MD and a rollout together"
+# MD's answer rests on no assumption: what saves less of its error does not pay.
+_PAYS = 0.9
 MD_STAGES: tuple[Stage, ...] = ("md", "held-out md")
 LEAST_BUDGET_S = 20.0
 # Of a budget: what is planned with, for stages take a while to stop.
@@ -124,8 +127,7 @@ def decide(
 
 
 def _shares(rates: Rates, way: Way, budget_s: float, left_s: float) -> dict[Stage, float]:
-    """Return the shares of what the report leaves; a rollout that MD cannot better goes on until what it samples is
-    known to half of what the model is off by."""
+    """Return the shares of what the report leaves."""
     if way == "md" and rates.replicas == 1:
         return _BY_STAGES
     shares = PLANS[way].shares
@@ -135,11 +137,7 @@ def _shares(rates: Rates, way: Way, budget_s: float, left_s: float) -> dict[Stag
         beside = _MD_BESIDE if _MD_BESIDE * left_s * rates.md_ps_per_s >= _LEAST_MD_PS else 0.0
         found: dict[Stage, float] = {name: (1.0 - beside) * share for name, share in _REWEIGHTED.items()}
         return {**found, "held-out md": beside} if beside else found
-    errors = expected_errors(rates, budget_s)
-    if errors["a rollout alone"] >= errors["MD from rollout frames"]:
-        return shares
-    enough_s = 2.0 * rates.relaxation_ps / MODEL_ERROR**2 / rates.rolls.ps_per_s
-    rolled = min(_MOST_ROLLED, max(shares["rollout"], enough_s / left_s))
+    rolled = min(reversed(_ROLLED), key=lambda share: expected_errors(rates, budget_s, rolled=(share,))[_TOGETHER])
     return {"rollout": rolled, "held-out md": 1.0 - rolled}
 
 
@@ -173,7 +171,8 @@ def _choose(rates: Rates, budget_s: float, way: str) -> tuple[Way, tuple[str, ..
         errors = expected_errors(rates, budget_s)
         best = min(error for name, error in errors.items() if "rollout" in name)
         by_md = errors["MD from many starts"]
-        pays = best < by_md or (rates.expensive and best == by_md)  # where neither comes to anything
+        # Where neither comes to anything it pays at quantum level.
+        pays = best < (1.0 if rates.expensive else _PAYS) * by_md or (rates.expensive and best == by_md)
         by_each = ", ".join(f"{100 * error:.2g} % by {name}" for name, error in errors.items())
         said = f"error to expect of a population: {by_each}, with {rates.relaxation_words}"
         if min(errors.values()) >= _MOST_ERROR:
@@ -210,7 +209,11 @@ def _base_ps(rates: Rates, way: Way) -> float:
 
 
 def expected_errors(
-    rates: Rates, budget_s: float, relaxation_ps: float | None = None, model_error: float = MODEL_ERROR
+    rates: Rates,
+    budget_s: float,
+    relaxation_ps: float | None = None,
+    model_error: float = MODEL_ERROR,
+    rolled: Sequence[float] = _ROLLED,
 ) -> dict[str, float]:
     """Return the error to expect of the population of a state at the end of a budget, by each way to spend it.
 
@@ -218,8 +221,8 @@ def expected_errors(
     relaxation times apart: Mueller-Krumbhaar and Binder, J. Stat. Phys. 8, 1 (1973)) of a `length` of all replicas
     together, and the mean of what is left of where they began, `t` being a replica's length over the relaxation time.
     `start` is 1/2 from one structure and 1/4 from starts spread evenly over two states, the means over all populations
-    that the states may have; from frames of a rollout it is that rollout's own error, `model_error` (0.1 unless
-    given) included.
+    that the states may have. A rollout is off by `model_error` (0.1 unless given) as well; MD and a rollout that has
+    one of the shares `rolled` of the time count each by its error.
     """
     relaxation_ps = max(rates.relaxation_ps if relaxation_ps is None else relaxation_ps, 1e-3)
     seconds = (1.0 - _REPORT_SHARE) * budget_s
@@ -227,20 +230,23 @@ def expected_errors(
     def error(ps_per_s: float, replicas: int, share: float, start: float) -> float:
         total_ps = max(ps_per_s * share * seconds, 1e-9)
         t = total_ps / replicas / relaxation_ps
-        return min(_MOST_ERROR, math.hypot(math.sqrt(0.5 * relaxation_ps / total_ps), start * -math.expm1(-t) / t))
+        return math.hypot(math.sqrt(0.5 * relaxation_ps / total_ps), start * -math.expm1(-t) / t)
 
-    def by_md(share: float, start: float) -> float:
+    def by_md(start: float, share: float = 1.0) -> float:
         return error(rates.md_ps_per_s, rates.replicas, share, start)
 
-    found = {"MD from one start": by_md(1.0, 0.5), "MD from many starts": by_md(1.0, 0.25 + 0.25 / rates.replicas)}
+    found = {"MD from one start": by_md(0.5), "MD from many starts": by_md(0.25 + 0.25 / rates.replicas)}
     if (rolls := rates.rolls) is not None:
-        shares = PLANS["rollout"].shares
-        whole, short = (
-            math.hypot(error(rolls.ps_per_s, rolls.replicas, share, 0.5), model_error)
-            for share in (1.0, shares["rollout"])
-        )
-        found |= {"a rollout alone": whole, "MD from rollout frames": by_md(shares["held-out md"], min(short, 0.5))}
-    return found
+
+        def by_rollout(share: float = 1.0) -> float:
+            return math.hypot(error(rolls.ps_per_s, rolls.replicas, share, 0.5), model_error)
+
+        found["a rollout alone"] = by_rollout()
+        if not rates.expensive:
+            # Transitions of MD do not remember where it began.
+            each = [1.0 / math.hypot(1.0 / by_md(0.0, 1.0 - s), 1.0 / by_rollout(s)) for s in rolled]
+            found[_TOGETHER] = min(each)
+    return {name: min(_MOST_ERROR, error) for name, error in found.items()}
 
 
 def table(rates: Rates, decision: Decision, budget_s: float) -> dict[str, str]:

@@ -326,7 +326,7 @@ def outcome(
         said += f" {words}"
     lines = evaluated.in_short if answer is None else answer.in_short
     on_surrogate = answer.on_surrogate if answer else ""
-    if answer is not None and on_surrogate and not answer.is_sure and not answer.is_by_surrogate:
+    if answer is not None and on_surrogate and not answer.is_sure and not answer.is_joint:
         what = "The rollout" if answer.is_reweighted else "MD"
         on_surrogate = f"{what} has not converged, and cannot say whether the surrogate's populations are right."
     return Outcome(
@@ -344,7 +344,7 @@ def lines_of(way: Way, evaluated: Evaluation, answer: Answer | None) -> tuple[st
     counts all frames of MD alike, and MD's transitions weigh them."""
     if answer is None or evaluated.status == "broken":
         return evaluated.in_short
-    if way == "md" or answer.is_by_surrogate or answer.is_reweighted:
+    if way == "md" or answer.is_joint or answer.is_reweighted:
         return answer.in_short
     rolled = [s for s in answer.states if s.surrogate is not None and not s.missing]
     off = [s for s in rolled if s.differs]

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from surrogate.comparison import md_answer as told
-from surrogate.comparison.markov import equilibrium
+from surrogate.comparison.markov import equilibrium, with_prior
 from surrogate.comparison.md_answer import Answer, frames_over_states, md_answer
 from surrogate.comparison.measure.torsions import find_torsions
 from surrogate.comparison.read.ensemble import Ensemble
@@ -117,6 +117,72 @@ def test_a_state_that_no_md_leaves_is_missing_not_invented(forms: np.ndarray) ->
     # Whichever side holds more frames has the weights; the other has none, and says so.
     assert bool(left.missing) != all(s.missing for s in answer.states if s.state != "left-handed")
     assert sum(float(w.sum()) for w in answer.weights) == pytest.approx(32 * 300)
+
+
+SLOW = np.array([[0.998, 0.002, 0.0], [0.004, 0.993, 0.003], [0.0, 0.009, 0.991]])
+
+
+def rolled(forms: np.ndarray, matrix: np.ndarray, n: int = 2000, seed: int = 9) -> Ensemble:
+    return ensemble(forms, jumps(matrix, [0, 0, 0, 0, 1, 1, 2, 2], n, seed), seed)
+
+
+def off(answer: Answer) -> float:
+    """The root mean square error of α, β and left-handed."""
+    return float(np.sqrt(np.mean([(s.share - p) ** 2 for s, p in zip(answer.states, POPULATIONS, strict=True)])))
+
+
+def test_short_md_and_a_surrogate_together_err_less_than_either(forms: np.ndarray) -> None:
+    """MD sees a dozen crossings in all; the surrogate is off by 10 %, at other rates."""
+    model = np.array([[0.996, 0.004, 0.0], [0.0053, 0.9887, 0.006], [0.0, 0.02, 0.98]])  # 0.50, 0.38, 0.12
+    own = rolled(forms, model)
+    errors = []
+    for seed in range(4):
+        md = ensemble(forms, jumps(SLOW, [0, 1, 2, 1] * 4, 150, 20 + seed), seed)
+        alone, joint = md_answer(md, 300.0), md_answer(md, 300.0, surrogate=own)
+        assert joint.is_joint and not alone.is_joint
+        errors.append((off(alone), off(joint)))
+        for s, p in zip(joint.states, POPULATIONS, strict=True):
+            assert abs(s.share - p) < 3.0 * s.error + 0.01 and s.error < 0.15
+            assert s.by_md == pytest.approx(next((a.share, a.error) for a in alone.states if a.state == s.state))
+        weights, states = np.concatenate(joint.weights), np.concatenate([_states(x) for x in md.segments])
+        shares = np.bincount(states, weights, minlength=3) / weights.sum()
+        assert shares == pytest.approx([s.share for s in joint.states], abs=0.02), "frames weigh as the states do"
+    alone, joint = np.sqrt(np.mean(np.square(errors), axis=0))
+    assert joint < 0.6 * alone and joint < 0.09
+
+
+def _states(frames: np.ndarray) -> np.ndarray:
+    from systems.chemistry.geometry import torsion
+
+    found = backbone_torsions(SCENE)
+    phi, psi = (torsion(frames, found[name][:1])[:, 0] for name in ("phi", "psi"))
+    return np.where(phi > 0, 2, np.where((psi > math.radians(-120)) & (psi < math.radians(80)), 0, 1))
+
+
+def test_a_surrogate_counts_for_less_the_more_md_has_seen(forms: np.ndarray) -> None:
+    """Counts of a rollout are worth a dozen crossings, however long it is."""
+    model = np.array([[0.99, 0.01, 0.0], [0.01, 0.98, 0.01], [0.0, 0.01, 0.99]])  # a third each
+    of_rollout, matrix = jumps(model, [0, 1, 2, 1] * 2, 4000, 1), SLOW
+    shares = []
+    for n in (100, 1000, 10_000):
+        md = list(jumps(matrix, [0, 1, 2, 1] * 4, n, 2))
+        alone = equilibrium(md)
+        longer = with_prior(alone, md, list(of_rollout), crossings=12.5).populations
+        twice = with_prior(alone, md, [*of_rollout, *of_rollout], crossings=12.5).populations
+        assert longer == pytest.approx(twice, abs=0.02)
+        whole = with_prior(alone, md, list(of_rollout), crossings=1e9).populations
+        shares.append((longer[2] - alone.populations[2], whole[2]))
+    assert abs(shares[2][0]) < 0.01 < abs(shares[0][0]), "what MD sees often is MD's"
+    assert shares[1][1] > 0.2, "negative control: counted whole the rollout outweighs MD"
+
+
+def test_a_visit_that_md_has_not_ended_is_no_trap(forms: np.ndarray) -> None:
+    """One replica enters the last state at its end; nothing but a rollout that hardly counts would have it leave."""
+    md = list(jumps(np.array([[0.95, 0.05, 0.0], [0.05, 0.95, 0.0], [0.0, 0.0, 1.0]]), [0, 1] * 8, 400, 3))
+    md[0][-3:] = 2
+    of_rollout = list(jumps(np.array([[0.9, 0.09, 0.01], [0.1, 0.9, 0.0], [0.5, 0.0, 0.5]]), [0, 1, 2, 0], 2000, 4))
+    found = with_prior(equilibrium(md, lag=1), md, of_rollout, crossings=0.01)
+    assert 0.0 < found.populations[2] < 0.002
 
 
 def test_a_rollout_is_reweighted_by_the_energies_of_its_reference(forms: np.ndarray) -> None:

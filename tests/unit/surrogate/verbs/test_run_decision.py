@@ -36,11 +36,9 @@ def test_where_md_forgets_its_start_too_slowly_a_rollout_finds_the_states() -> N
     slow = replace(COVERED, rolls=replace(fast, relaxation_ps=20_000.0))
     found = decide(slow, 60.0)
     assert found.way == "rollout" and named(found) == ["rollout", "held-out md", "report"]
-    assert found.seconds("held-out md") == found.seconds("rollout"), "MD can only test it in a minute"
-    longer = decide(slow, 2400.0)
-    assert longer.expected_rollout_ps == pytest.approx(200 * 20_000.0), "its sampling is off by half of the model"
+    assert found.seconds("held-out md") == found.seconds("rollout"), "in a minute MD adds next to nothing"
     able = decide(replace(slow, at_once=16, md_ps_per_s=3200.0), 3600.0)
-    assert able.way == "rollout" and able.seconds("held-out md") > 8 * able.seconds("rollout")
+    assert able.way == "rollout" and able.seconds("held-out md") > 2 * able.seconds("rollout")
     assert found.expected_rollout_ps == pytest.approx(16_000.0 * found.seconds("rollout"))
     assert "a slowest relaxation of 20 ns, as the first rollouts show" in found.why[1]
     quick = replace(COVERED, rolls=replace(fast, relaxation_ps=20.0))
@@ -114,13 +112,14 @@ def test_each_way_is_expected_to_err_by_what_it_forgets_and_what_it_samples() ->
     rolls = replace(FAST, ps_per_s=16_000.0)
     simd = replace(COVERED, platform="simd", at_once=16, md_ps_per_s=1000.0, rolls=rolls)
     slow, fast = (expected_errors(simd, 120.0, tau_ps, 0.05) for tau_ps in (2000.0, 10.0))
-    assert slow["MD from one start"] > 1.3 * slow["MD from many starts"] > 1.69 * slow["MD from rollout frames"]
-    assert fast["MD from one start"] < 1.2 * fast["MD from many starts"] < 1.2 * fast["MD from rollout frames"]
-    assert slow["a rollout alone"] > 0.05
+    both = "MD and a rollout together"
+    assert slow["MD from one start"] > 1.3 * slow["MD from many starts"] > 1.69 * slow[both]
+    assert fast["MD from one start"] < 1.2 * fast["MD from many starts"] < 1.2 * fast[both]
+    assert slow["a rollout alone"] > max(0.05, 0.95 * slow[both])
     wrong = expected_errors(simd, 120.0, 2000.0, 0.4)
-    assert wrong["MD from rollout frames"] > 1.7 * slow["MD from rollout frames"], (
-        "a rollout that errs begins MD wrongly"
-    )
+    md = np.sqrt(0.5 * 2000.0 / (0.9 * 0.85 * 120.0 * 1000.0))
+    assert 1.2 * slow[both] < wrong[both] <= md, "a rollout that errs adds nothing to MD"
+    assert both not in expected_errors(replace(simd, expensive=True), 120.0), "its energies weigh it"
     assert "a rollout alone" not in expected_errors(UNCOVERED, 120.0)
 
 

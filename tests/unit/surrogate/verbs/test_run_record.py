@@ -187,20 +187,21 @@ def test_an_answer_that_does_not_hold_is_not_to_be_used() -> None:
     assert told("rollout", None).in_short == ("Use it.", "Right: all.", "Why: so."), "no torsion turns"
 
 
-def test_where_md_is_too_short_to_do_better_the_surrogate_s_populations_are_the_answer() -> None:
+def test_where_md_is_too_short_the_surrogate_counts_with_it_unless_md_contradicts() -> None:
     vague = (state(error=0.18), state(state="β", error=0.18))
     short = answer(holds=False, states=vague)
-    found = told("rollout", None, answer=short)
-    assert found.in_short[0] == "Use the surrogate's populations for now, not MD's." and not found.converged
-    assert "to about 10 % (assumed)" in found.in_short[1] and "off by up to 18 %" in found.in_short[2]
-    assert lines_of("rollout", evaluation(None), short) == short.in_short
-    assert short.to_dict()["populations_by"] == "surrogate" and answer().to_dict()["populations_by"] == "MD"
-    for holds, surrogate, is_by in ((False, 0.3, False), (False, 0.19, True), (True, 0.19, False)):
+    joint = replace(short, states=tuple(replace(s, error=0.07, md_share=s.share, md_error=s.error) for s in vague))
+    found = told("rollout", None, answer=joint)
+    assert found.in_short[0] == "Use MD's and the surrogate's populations together, for now." and not found.converged
+    assert "each to 7 % or better" in found.in_short[1] and "by itself off by up to 18 %" in found.in_short[2]
+    assert lines_of("rollout", evaluation(None), joint) == joint.in_short
+    assert joint.to_dict()["populations_by"] == "MD and surrogate" and answer().to_dict()["populations_by"] == "MD"
+    assert "; MD 50.0 ± 18.0 %; surrogate" in joint.table()[0][1] and "MD" not in short.table()[0][1]
+    for holds, surrogate, wants in ((False, 0.6, False), (False, 0.3, True), (True, 0.3, False), (True, 0.19, True)):
         more = state(state="left-handed", share=0.01, error=0.05, surrogate=surrogate)
-        short_or_sure = answer(holds=holds, states=(*vague, more))
-        assert short_or_sure.is_by_surrogate == is_by, "what MD contradicts is no answer"
-    assert not answer(states=tuple(replace(s, surrogate_error=0.2) for s in vague)).is_by_surrogate, "nor what is vague"
-    assert not answer(states=tuple(replace(s, surrogate=None) for s in vague)).is_by_surrogate
+        assert answer(holds=holds, states=(*vague, more)).wants_surrogate == wants, "what MD contradicts does not count"
+    assert not answer(states=tuple(replace(s, error=0.02) for s in vague)).wants_surrogate, "MD is sure by itself"
+    assert not answer(states=tuple(replace(s, surrogate=None) for s in vague)).wants_surrogate
 
 
 def test_a_longer_budget_is_named_only_where_its_replicas_outlast_what_is_slow() -> None:
@@ -242,7 +243,7 @@ def test_a_reweighted_rollout_is_the_answer_and_claims_no_md() -> None:
     )
     assert "agree with the reweighted ones in all 2 states" in found.on_surrogate
     told_of = reweighted.to_dict()
-    assert told_of["populations_by"] == "reweighting" and not reweighted.is_by_surrogate
+    assert told_of["populations_by"] == "reweighting" and not reweighted.wants_surrogate
     # Monte Carlo turned its torsions.
     assert "relaxation" not in found.headline and "process" not in found.headline and not told_of["timescales_ps"]
     assert answer().to_dict()["timescales_ps"] == [900.0]
