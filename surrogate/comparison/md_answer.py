@@ -39,8 +39,8 @@ _MAP_BINS = 36
 _KINDS = (*SLOW_KINDS, "ring")
 # Shares are given no smaller error than counting leaves, and differ when they are so many errors apart.
 _APART, _LEAST_APART = 2.5, 0.02
-# Few transitions tell too small an error: of MD that has not converged a difference is no contradiction before this.
-_CONTRADICTS = 4.0
+# MD contradicts a surrogate where it moves a share so many errors from the surrogate's.
+_CONTRADICTS = 3.0
 # What a surrogate is taken to be off by in the population of a state: weights keep no such number. So far is off what
 # n crossings either way tell of a state of population 1/2: sqrt(2 / n) / 4.
 MODEL_ERROR = 0.1
@@ -83,16 +83,21 @@ class StateEnergy:
 
     @property
     def differs(self) -> bool:
-        """Whether the surrogate's share is outside the errors."""
-        return self.is_apart(_APART)
-
-    def is_apart(self, n_errors: float, model_error: float = 0.0) -> bool:
-        """Whether the surrogate's share is so many errors from MD's, a `model_error` of the surrogate included."""
+        """Whether the surrogate's share is outside the errors of MD's and its own."""
         if self.surrogate is None or self.missing:
             return False
         share, error = self.by_md
-        error = math.hypot(error, self.surrogate_error or 0.0, model_error)
-        return abs(self.surrogate - share) > max(n_errors * error, _LEAST_APART)
+        error = math.hypot(error, self.surrogate_error or 0.0)
+        return abs(self.surrogate - share) > max(_APART * error, _LEAST_APART)
+
+    @property
+    def moved(self) -> float:
+        """How many errors MD has moved the surrogate's share. The variance of what data move a prior by is the prior's
+        less what is left; the error that is left is the least."""
+        if self.surrogate is None:
+            return 0.0
+        known = max(MODEL_ERROR**2 + (self.surrogate_error or 0.0) ** 2 - self.error**2, self.error**2)
+        return abs(self.share - self.surrogate) / math.sqrt(known)
 
 
 @dataclass(frozen=True, eq=False)
@@ -156,14 +161,17 @@ class Answer:
 
     @property
     def wants_surrogate(self) -> bool:
-        """Whether a surrogate's transitions would make it better: MD has not converged, or has large errors, and
-        contradicts the surrogate nowhere."""
+        """Whether a surrogate's transitions may make it better: MD has not converged, or has large errors."""
         both = [s for s in self.states if s.surrogate is not None and not s.missing]
-        n_errors = _APART if self.is_sure else _CONTRADICTS
-        if not both or self.is_reweighted or any(s.is_apart(n_errors, MODEL_ERROR) for s in both):
+        if not both or self.is_reweighted:
             return False
         error = math.sqrt(sum(s.error**2 for s in both) / len(both))
         return not self.is_sure or error > _BY_ITSELF * MODEL_ERROR
+
+    @property
+    def contradicts(self) -> bool:
+        """Whether MD contradicts the surrogate whose transitions count with its own."""
+        return self.is_joint and any(s.moved > _CONTRADICTS for s in self.states)
 
     @property
     def in_short(self) -> tuple[str, str, str]:
@@ -212,6 +220,11 @@ class Answer:
         weighted = [s for s in self.states if s.surrogate is not None and not s.missing]
         if not weighted:
             return ""
+        if self.is_joint:
+            most = max(weighted, key=lambda s: abs(s.share - (s.surrogate or 0.0)))
+            to = percent(most.share, most.error)
+            rolled = f"{100 * (most.surrogate or 0.0):.3g} %"
+            return f"MD moves the surrogate's populations most in {most.torsion} {most.state}: {rolled} becomes {to}."
         off = sorted((s for s in weighted if s.differs), key=lambda s: -abs((s.surrogate or 0.0) - s.by_md[0]))
         if not off:
             widest = max(s.by_md[1] for s in weighted)
@@ -376,7 +389,8 @@ def md_answer(
     if not math.isclose(surrogate.lag_ps, ps, rel_tol=1e-6):
         return answer
     with suppress(InputError):
-        return _joint(answer, found, (angles, own), named, torsions, temperature_k, seed)
+        joint = _joint(answer, found, (angles, own), named, torsions, temperature_k, seed)
+        return answer if joint.contradicts else joint
     return answer
 
 

@@ -67,7 +67,8 @@ def run(scene: PathLike | Scene, out: PathLike | None = None, *, options: RunOpt
     covers it and MD is cheap, MD takes the whole budget, its replicas beginning in many states (`starts`); at
     `level='gfn2-xtb'` a potential learns the molecule first. `way` overrides that. `dry_run`: the decision alone. The
     answer is MD's: its transitions give populations, free energies and timescales with errors (`equilibrium.json`), and
-    each frame of MD a weight (`sm.frame_weights`); the surrogate is reported beside that.
+    each frame of MD a weight (`sm.frame_weights`); the surrogate's count with them where MD is too short, and it is
+    reported beside that.
 
     The folder `out` holds `report.html`, whose first line says what was achieved, the trajectory, `reference/`, the
     weights that were trained, `run.json` (the record that is returned: rates, decision, stages, seeds, versions) and
