@@ -37,7 +37,7 @@ from md_reference.run.replicas import simulate_replicas
 from md_reference.simd.force_field import n_replicas
 from surrogate.comparison.convergence import tested_reference
 from surrogate.comparison.equivalent_time import EquivalentTime
-from surrogate.comparison.md_answer import MODEL_ERROR, Answer, md_answer
+from surrogate.comparison.md_answer import Answer, md_answer
 from surrogate.comparison.measure.distributions import distance
 from surrogate.comparison.measure.slow_motion import angles_of
 from surrogate.comparison.measure.structure import Baseline, evenly
@@ -255,8 +255,6 @@ def population_error(ref: Angles, other: Angles, weights: Sequence[FloatArray] |
 
 def stated_error(answer: dict[str, Any]) -> float:
     """Return the root mean square error that a run states of its populations, in per cent."""
-    if answer["populations_by"] == "surrogate":
-        return 100.0 * MODEL_ERROR
     errors = [s["error"] for s in answer["states"] if not s["missing"]]
     return 100.0 * math.sqrt(float(np.mean(np.square(errors)))) if errors else math.nan
 
@@ -333,10 +331,7 @@ def errors_of_ways(result: RunResult, minutes: float, place: Path, ref: LongMD) 
     md_ps = md_length_ps(rates, minutes)
     found: dict[str, tuple[float, float]] = {}
     answer = result.answer
-    if answer.get("populations_by") == "surrogate":
-        found["run"] = ref.errors(ref.load(result.trajectory))
-    else:
-        found["run"] = ref.errors(ref.load(result.md), [sm.frame_weights(f) for f in result.md] if answer else None)
+    found["run"] = ref.errors(ref.load(result.md), [sm.frame_weights(f) for f in result.md] if answer else None)
     if one := finished(place / "one"):
         md = ref.load(one, md_ps)
         if len(md.segments[0]) * md.lag_ps > LONG_ENOUGH * md_ps:

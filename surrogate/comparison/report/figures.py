@@ -361,5 +361,5 @@ def weighted_maps(maps: dict[str, FloatArray]) -> list[Figure]:
     for label, energy in list(maps.items())[:_MOST_ANSWER_MAPS]:
         shown = np.where(np.isfinite(energy), energy, np.nan)
         picture = energy_map(f"By MD's weights, {label}", shown, (_CIRCLE, _CIRCLE), ("φ / °", "ψ / °"))
-        found.append(Figure(picture, f"{label}: free energy by MD's answer, all its frames weighted"))
+        found.append(Figure(picture, f"{label}: free energy by the answer, all of its frames weighted"))
     return found
