@@ -327,7 +327,7 @@ def overview(drawn: Sequence[tuple[str, Sequence[Chart]]], temperature_k: float)
 
 
 def answer_overview(molecule: str, answer: dict[str, Any]) -> MatplotlibFigure:
-    """Return a figure of an `Answer.to_dict()`: populations of all states by MD with their errors, beside a
+    """Return a figure of an `Answer.to_dict()`: populations of all states with their errors, beside a
     surrogate's, and the first residues' free energies over φ and ψ."""
     from matplotlib.figure import Figure
 
@@ -336,7 +336,7 @@ def answer_overview(molecule: str, answer: dict[str, Any]) -> MatplotlibFigure:
     figure: Any = Figure(figsize=(4.0 * (1 + len(maps)), max(3.5, 0.22 * len(states))), layout="constrained")
     bars, *others = figure.subplots(1, 1 + len(maps), squeeze=False)[0]
     shares, errors = ([s[key] for s in states] for key in ("share", "error"))
-    bars.barh(range(len(states)), shares, xerr=errors, color="0.75", label="MD")
+    bars.barh(range(len(states)), shares, xerr=errors, color="0.75", label=answer.get("populations_by", "MD"))
     own = [(k, s["surrogate"], s["surrogate_error"]) for k, s in enumerate(states)]
     rolled = [(k, share, error or 0.0) for k, share, error in own if share is not None]
     if rolled:
