@@ -43,7 +43,7 @@ _LEAST_CROSSINGS = 5
 # What has fewer frames than this share is not named as missing.
 _NAMED_SHARE = 0.005
 
-Fate = Literal["only begun in", "entered and never left", "left and never entered"]
+Fate = Literal["only begun in", "entered and never left", "begun in and not always left", "left and never entered"]
 
 
 class Unconnected(NamedTuple):
@@ -243,9 +243,11 @@ def with_mean_one(weights: Sequence[FloatArray]) -> tuple[FloatArray, ...]:
 
 
 def _averaged(found: Equilibrium, micro: list[IntArray], left_out: int) -> Equilibrium:
-    """Return plain averages over all frames behind the first `left_out` of each replica."""
+    """Return plain averages over all frames behind the first `left_out` of each replica, but for those in states that
+    were left for good."""
     n_micro = len(found.populations)
-    weights = [((np.arange(len(m)) >= left_out) & (m >= 0)).astype(np.float64) for m in micro]
+    counted = np.append(found.populations > 0.0, False)
+    weights = [((np.arange(len(m)) >= left_out) & counted[m]).astype(np.float64) for m in micro]
     counts = np.array([
         np.bincount(micro[k][a:b][weights[k][a:b] > 0], minlength=n_micro) for k, a, b in found.unit_of
     ], dtype=np.float64)  # fmt: skip
@@ -478,7 +480,17 @@ def _unconnected(model: _Model, micro: list[IntArray]) -> tuple[Unconnected, ...
             continue
         others = np.setdiff1d(np.arange(model.n), members)
         out, back = model.counts[np.ix_(members, others)].sum(), model.counts[np.ix_(others, members)].sum()
-        fate: Fate = "left and never entered" if out else "entered and never left" if back else "only begun in"
+        # A replica that is still there says that it is left slowly, not that it weighs nothing.
+        stayed = any(m[-1] in members for m in micro)
+        fate: Fate = "only begun in"
+        if out or back:
+            fate = (
+                "entered and never left"
+                if back
+                else "begun in and not always left"
+                if stayed
+                else "left and never entered"
+            )
         fates.setdefault(fate, []).extend(members.tolist())
     return tuple(
         Unconnected(

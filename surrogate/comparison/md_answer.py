@@ -161,12 +161,13 @@ class Answer:
 
     @property
     def wants_surrogate(self) -> bool:
-        """Whether a surrogate's transitions may make it better: MD has not converged, or has large errors."""
+        """Whether a surrogate's transitions may make it better: MD has not converged, lacks states, or has large
+        errors."""
         both = [s for s in self.states if s.surrogate is not None and not s.missing]
         if not both or self.is_reweighted:
             return False
         error = math.sqrt(sum(s.error**2 for s in both) / len(both))
-        return not self.is_sure or error > _BY_ITSELF * MODEL_ERROR
+        return not self.is_sure or bool(self.missing) or error > _BY_ITSELF * MODEL_ERROR
 
     @property
     def contradicts(self) -> bool:

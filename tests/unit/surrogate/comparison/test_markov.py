@@ -118,6 +118,24 @@ def test_a_state_that_was_invented_is_left_and_has_no_weight() -> None:
     assert (np.abs(found.populations[:3] - POPULATIONS) < 3.0 * found.draws.std(0)[:3] + 0.01).all()
 
 
+def test_a_state_that_is_left_slowly_is_not_left_for_good() -> None:
+    """Alanine dipeptide's left-handed state in a short run: four replicas begin there, one leaves."""
+    matrix = np.zeros((4, 4))
+    matrix[:3, :3] = chain(rate=0.2)
+    matrix[3, 3] = 1.0
+    micro = run(matrix, [0, 1, 2, 3] * 4, 2000)
+    micro[3][700:] = 0
+    found = equilibrium(micro)
+    (lost,) = found.unconnected
+    assert lost.fate == "begun in and not always left" and lost.n_replicas == 4
+    assert found.method == "Markov model" and found.populations[3] == 0.0, "plain averages would weigh where it began"
+    for m in micro[7::4]:
+        m[700:] = 0
+    gone = equilibrium(micro)
+    assert gone.method == "plain averages" and gone.unconnected[0].fate == "left and never entered", "control"
+    assert gone.populations[3] == 0.0 and not any(w[m == 3].any() for w, m in zip(gone.weights, micro, strict=True))
+
+
 def test_a_state_that_is_entered_and_never_left_is_said() -> None:
     matrix = np.zeros((4, 4))
     matrix[:3, :3] = chain()
