@@ -34,7 +34,7 @@ HOT_K, HOT_PS, FRICTION_PER_PS = 500.0, 100.0, 5.0
 _COOLING = 0.2
 # By OpenMM, one after the other: so far apart, of that time.
 _APART = 0.2
-_TURNED_PS, _STIFFNESS_KJ_MOL = 20.0, 300.0
+_TURNED_PS, _LEAST_TURNED, _STIFFNESS_KJ_MOL = 20.0, 0.2, 300.0
 _PIECE = 500
 # A scene for each replica, and how they were found, in a few words.
 Starts = tuple[tuple[Scene, ...], str]
@@ -46,8 +46,9 @@ def many_starts(scene: Scene, conditions: Conditions, n: int, *, hot_ps: float =
 
     They come from `hot_ps` at 500 K, of the structure given and of conformers whose rings pucker differently, and a
     fifth of that at the bath's temperature, by SIMD replicas where these run the scene, else by OpenMM; at quantum
-    level by GAFF2. In explicit water the solute is turned to the torsions that its dry self then has. Where nothing
-    turns, or hot MD fails, all begin in the scene's own structure, and `how` says so.
+    level by GAFF2. In explicit water the solute is turned to the torsions that its dry self then has, in 20 ps, or in
+    as much less as `hot_ps` is less than 100, but in 4. Where nothing turns, or hot MD fails, all begin in the scene's
+    own structure, and `how` says so.
     """
 
     def one(why: str) -> Starts:
@@ -66,9 +67,9 @@ def many_starts(scene: Scene, conditions: Conditions, n: int, *, hot_ps: float =
         spec = _hot_forces(conditions.force)
         frames, by = _hot(dry, conformers, replace(conditions, force=spec, ensemble="nvt"), n, hot_ps)
         if scene.cell_nm is not None:
-            frames = _in_water(
-                scene, conditions, dry, np.asarray(torsion(frames, rotatable_torsions(dry)), dtype=np.float64)
-            )
+            angles = np.asarray(torsion(frames, rotatable_torsions(dry)), dtype=np.float64)
+            turned_ps = _TURNED_PS * min(1.0, max(_LEAST_TURNED, hot_ps / HOT_PS))
+            frames = _in_water(scene, conditions, dry, angles, turned_ps)
     except (PreparationError, SimulationError) as error:
         return one(str(error).rstrip("."))
     how = f"{n} starts: the structure given and, {by}, states after {hot_ps:.3g} ps at {HOT_K:g} K"
@@ -181,8 +182,8 @@ def _by_openmm(
             yield engine.positions()[None]
 
 
-def _in_water(wet: Scene, conditions: Conditions, dry: Scene, angles: FloatArray) -> FloatArray:
-    """Return positions `(n, n_atoms, 3)` in water whose solute was turned to these torsions `(n, k)`."""
+def _in_water(wet: Scene, conditions: Conditions, dry: Scene, angles: FloatArray, turned_ps: float) -> FloatArray:
+    """Return positions `(n, n_atoms, 3)` in water whose solute was turned to these torsions `(n, k)` in that time."""
     solute = solute_of(wet)
     quads: IntArray = np.asarray(solute)[rotatable_torsions(dry)]
     system = build_system(wet, conditions.force)
@@ -201,7 +202,7 @@ def _in_water(wet: Scene, conditions: Conditions, dry: Scene, angles: FloatArray
         for share in (0.1, 0.3, 1.0):
             for place in range(len(quads)):
                 run.set_bias(place, own[:, place], share * _STIFFNESS_KJ_MOL)
-            _steps(run, _TURNED_PS / 3)
+            _steps(run, turned_ps / 3)
         last = min(n_replicas(), len(angles) - first)
         out[first : first + last] = run.positions_nm[:last]
     flags = check_frames(out[:, np.asarray(solute)], geometry_from_scene(dry)) & _KEPT

@@ -15,7 +15,7 @@ from md_reference.forces.spec import QUANTUM, QUANTUM_SOLVENTS
 from md_reference.run.config import SIMD, MDConfig
 from surrogate.models.architecture import shipped_weights, weights_path
 from systems.errors import OutOfDomainError, SimulationError
-from systems.scene import Scene
+from systems.scene import Scene, part_of
 from systems.units import format_time_ps
 
 if TYPE_CHECKING:
@@ -50,12 +50,12 @@ class Rolls:
 
 @dataclass(frozen=True)
 class Rates:
-    """What was measured. `stretch`: wall seconds of a second of processor time with all `cores` in use, 1 where no
-    other work shares them. `step_s`: processor seconds of a step of OpenMM's on one core; `md_ps_per_s`: of MD on all
-    cores in a second of wall time, by the fastest way: on this `platform`, `at_once` replicas on each core; `md`: in
-    words; `expensive`: it is quantum mechanics. `rolls`: of weights that cover the scene, None where none do;
-    `coverage`: why these, or none. `without_simd`: why MD is not run by SIMD, where it might have been; `in_water`: in
-    ALPB water, in which no potential learns.
+    """What was measured. `n_atoms`: that are written; `stretch`: wall seconds of a second of processor time with all
+    `cores` in use, 1 where no other work shares them. `step_s`: processor seconds of a step of OpenMM's on one
+    core; `md_ps_per_s`: of MD on all cores in a second of wall time, by the fastest way: on this `platform`, `at_once`
+    replicas on each core; `md`: in words; `expensive`: it is quantum mechanics. `rolls`: of weights that cover the
+    scene, None where none do; `coverage`: why these, or none. `without_simd`: why MD is not run by SIMD, where it might
+    have been; `in_water`: in ALPB water, in which no potential learns.
     """
 
     n_atoms: int
@@ -111,8 +111,9 @@ def measure(scene: Scene, config: MDConfig, named: str | Path | None, cores: int
     assert plan.us_per_step is not None
     weights, coverage = _covering(scene, config, named)
     rates = Rates(
-        n_atoms=scene.n_atoms, cores=cores, stretch=stretch, expensive=config.force.force_field == QUANTUM,
-        in_water=config.force.solvent in QUANTUM_SOLVENTS, md=plan.line, step_s=plan.us_per_step * 1e-6,
+        n_atoms=_n_written(scene, by_openmm), cores=cores, stretch=stretch,
+        expensive=config.force.force_field == QUANTUM, in_water=config.force.solvent in QUANTUM_SOLVENTS,
+        md=plan.line, step_s=plan.us_per_step * 1e-6,
         timestep_ps=config.timestep_ps, md_ps_per_s=0.0, coverage=coverage, platform=by_openmm.platform,
         rolls=None if weights is None else rollout_rate(scene, weights, config.temperature_k, stretch, cores),
     )  # fmt: skip
@@ -144,7 +145,14 @@ def _by_simd(rates: Rates, scene: Scene, config: MDConfig) -> Rates:
     ps_per_s = rates.cores * config.timestep_ps / (plan.us_per_step * 1e-6) / rates.stretch
     if ps_per_s <= rates.md_ps_per_s and not asked_for:
         return replace(rates, without_simd="no faster than OpenMM here")
-    return replace(rates, md=plan.line, md_ps_per_s=ps_per_s, platform=SIMD, at_once=at_once)
+    n_atoms = _n_written(scene, replace(config, platform=SIMD))
+    return replace(rates, n_atoms=n_atoms, md=plan.line, md_ps_per_s=ps_per_s, platform=SIMD, at_once=at_once)
+
+
+def _n_written(scene: Scene, config: MDConfig) -> int:
+    """Return how many atoms MD of a scene writes: not its water, where that is left out."""
+    kept = config.kept_atoms(scene)
+    return scene.n_atoms if kept is None else len(kept)
 
 
 def by_openmm(rates: Rates, scene: Scene, config: MDConfig, why: str) -> Rates:
@@ -154,7 +162,10 @@ def by_openmm(rates: Rates, scene: Scene, config: MDConfig, why: str) -> Rates:
 
     choice = platform_for(scene, replace(config, platform="auto"))
     line = plan_line(scene, config, choice, step_s=rates.step_s)
-    return replace(rates, md=line, md_ps_per_s=rates.openmm_ps_per_s, platform="auto", at_once=1, without_simd=why)
+    n_atoms = _n_written(scene, replace(config, platform="auto"))
+    return replace(
+        rates, n_atoms=n_atoms, md=line, md_ps_per_s=rates.openmm_ps_per_s, platform="auto", at_once=1, without_simd=why
+    )
 
 
 def rollout_rate(scene: Scene, weights: Weights, temperature_k: float, stretch: float, cores: int) -> Rolls:
@@ -206,10 +217,13 @@ def _slowest_ps(files: list[Path]) -> float:
 
 def _covering(scene: Scene, config: MDConfig, named: str | Path | None) -> tuple[Weights | None, str]:
     """Return the weights that cover the scene under these conditions, and why these or why none."""
+    from md_reference.forces.mixture import solute_of
     from surrogate.models.weights import load_weights
     from surrogate.sampling.domain import check_conditions, choose_weights, match_domain
 
     asked = {"force_field": config.force.force_field, "solvent": config.force.solvent}
+    if len(solute := solute_of(scene)) < scene.n_atoms and scene.cell_nm is not None:
+        scene = part_of(scene, solute)  # no weights know water
     if named is None:
         try:
             return choose_weights(scene, temperature_k=config.temperature_k, conditions=asked)

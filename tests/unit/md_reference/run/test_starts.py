@@ -10,7 +10,8 @@ import pytest
 
 import md_reference.run.starts as starts
 from md_reference.forces.forcefield import resolve
-from md_reference.forces.spec import ForceFieldSpec
+from md_reference.forces.solvation import solvate
+from md_reference.forces.spec import ForceFieldSpec, WaterBox
 from md_reference.run.config import Conditions, MDConfig
 from md_reference.run.replicas import simulate_replicas
 from md_reference.run.starts import frames_as_starts, many_starts
@@ -92,6 +93,20 @@ def test_what_cannot_turn_begins_in_one_structure() -> None:
     scenes, how = many_starts(methane, conditions(methane), 3)
     assert "one structure" in how and "no torsion" in how
     assert all(s is methane for s in scenes)
+
+
+def test_in_water_little_time_is_for_turning_where_little_is_for_being_hot(monkeypatch: pytest.MonkeyPatch) -> None:
+    wet = solvate(SCENE, spec := ForceFieldSpec("ff14SB", "tip3p"), WaterBox())
+    asked: list[float] = []
+
+    def turned(scene: Scene, how: Conditions, dry: Scene, to: np.ndarray, turned_ps: float) -> np.ndarray:
+        asked.append(turned_ps)
+        return np.repeat(scene.positions_nm[None], len(to), axis=0)
+
+    monkeypatch.setattr(starts, "_in_water", turned)
+    for hot_ps in (2.0, 50.0):
+        many_starts(wet, Conditions(spec, seed=3), 2, hot_ps=hot_ps)
+    assert asked == [4.0, 10.0]
 
 
 def test_frames_that_are_another_molecule_are_no_starts() -> None:
