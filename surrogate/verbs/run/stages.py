@@ -375,7 +375,7 @@ def _remedy(comparison: Comparison, costs: Costs) -> str:
         return f"a budget of about {format_wall(float(f'{costs.budget_s * times:.2g}'))}"
 
     if found is not None and not found.converged and not found.n_replicas:
-        return f"the MD it is compared with is too short to be tested: {found.reasons[0]}."
+        return f"The MD it is compared with is too short to be tested: {found.reasons[0]}."
     if found is not None and not found.converged:
         said = f"MD, {found.verdict.rstrip('.')}; {found.remedy}"
         if found.needed_ps is None or found.needed_ps <= found.replica_ps:
