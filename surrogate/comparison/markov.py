@@ -23,9 +23,10 @@ from surrogate.comparison.measure.statistics import Blocks, BoolArray, FloatArra
 from systems.errors import InputError
 
 _N_DRAWS, _FLAT_DRAWS = 50, 20
-# Of the likelihood's fixed point: change of log populations in a step at its end, most steps, and longest jumps, in
-# steps and in log populations.
-_STEP_TOLERANCE, _MOST_STEPS, _FURTHEST, _LONGEST_JUMP = 1e-9, 5_000, 1e6, 20.0
+# Of the likelihood's fixed point: change of log populations in a step at its end; change of populations, which is
+# enough for a draw, and after most steps: what hardly weighs anything is found last; longest jumps, in steps and in log
+# populations.
+_STEP_TOLERANCE, _SETTLED, _MOST_STEPS, _FURTHEST, _LONGEST_JUMP = 1e-9, 1e-9, 5_000, 1e6, 20.0
 _LAGS = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000, 5000)
 # A lag leaves each replica four pairs that do not overlap.
 _LAGS_A_REPLICA = 4
@@ -200,16 +201,18 @@ def with_prior(
     multiplicity = np.hstack([found.resampled, drawn])
     n_md = len(of_md)
 
-    def populations(each: FloatArray) -> FloatArray:
+    def populations(each: FloatArray, settled: float = _SETTLED) -> FloatArray | None:
         md, rolled = (np.tensordot(each[part], by_unit[part], 1) for part in (slice(n_md), slice(n_md, None)))
-        fitted = _fit(_ended(md) + rolled)
+        fitted = _fit(_ended(md) + rolled, settled)
+        if fitted is None:
+            return None
         out = np.zeros(n)
-        if fitted is not None:
-            out[fitted[2]] = fitted[1]
+        out[fitted[2]] = fitted[1]
         return out
 
-    all_units = populations(np.r_[np.ones(len(of_md)), np.full(len(of_prior), scale)])
-    if not all_units.any():
+    all_units = populations(np.r_[np.ones(len(of_md)), np.full(len(of_prior), scale)], 0.0)
+    draws = [(m, p) for m, p in ((m, populations(m)) for m in multiplicity) if p is not None]
+    if all_units is None or not draws:
         raise InputError("no reversible Markov model fits the transitions of MD and of the rollout.")
     visits = [sum(np.bincount(m[m >= 0], minlength=n) for m in of) for of in (micro, prior)]
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -217,8 +220,8 @@ def with_prior(
         other = np.where((visits[0] == 0) & (visits[1] > 0), all_units / visits[1], 0.0)
     weights = [np.append(of, 0.0)[m] for of, some in ((own, micro), (other, prior)) for m in some]
     return replace(
-        found, method="Markov model", populations=all_units, draws=np.array([populations(m) for m in multiplicity]),
-        resampled=multiplicity, unit_of=(*of_md, *((len(micro) + k, a, b) for k, a, b in of_prior)),
+        found, method="Markov model", populations=all_units, draws=np.array([p for _, p in draws]),
+        resampled=np.array([m for m, _ in draws]), unit_of=(*of_md, *((len(micro) + k, a, b) for k, a, b in of_prior)),
         weights=with_mean_one(weights),
     )  # fmt: skip
 
@@ -285,7 +288,7 @@ def _components(counts: FloatArray) -> IntArray:
     return np.asarray(rank[labels])
 
 
-def _fit(counts: FloatArray) -> tuple[FloatArray, FloatArray, IntArray] | None:
+def _fit(counts: FloatArray, settled: float = 0.0) -> tuple[FloatArray, FloatArray, IntArray] | None:
     """Return transition matrix and stationary distribution of the largest connected set, and its states; None where
     there is none, or the estimate does not converge."""
     kept = np.flatnonzero((_components(counts) == 0) & (counts.sum(0) + counts.sum(1) > 0))
@@ -293,13 +296,14 @@ def _fit(counts: FloatArray) -> tuple[FloatArray, FloatArray, IntArray] | None:
         return None
     if len(kept) == 1:
         return np.ones((1, 1)), np.ones(1), kept
-    found = reversible(counts[np.ix_(kept, kept)])
+    found = reversible(counts[np.ix_(kept, kept)], settled)
     return None if found is None else (*found, kept)
 
 
-def reversible(counts: FloatArray) -> tuple[FloatArray, FloatArray] | None:
+def reversible(counts: FloatArray, settled: float = 0.0) -> tuple[FloatArray, FloatArray] | None:
     """Return the reversible transition matrix `(n, n)` of greatest likelihood, and its stationary distribution `(n,)`,
-    of counts that connect all states both ways; None where it is not found.
+    of counts that connect all states both ways, or one whose populations change by less than `settled` in a step of its
+    search; None where it is not found.
 
     The flux is x_ij = (c_ij + c_ji) / (c_i / x_i + c_j / x_j) with x_i its sum over j (Prinz et al., equation 30), here
     by fixed-point iteration in log x, sped up by squared extrapolation (Varadhan and Roland, Scand. J. Stat. 35, 335
@@ -318,7 +322,7 @@ def reversible(counts: FloatArray) -> tuple[FloatArray, FloatArray] | None:
         first = step(y)
         second = step(first)
         r, v = first - y, second - 2.0 * first + y
-        if float(np.abs(r).max()) < _STEP_TOLERANCE:
+        if float(np.abs(r).max()) < _STEP_TOLERANCE or float((np.exp(y) * np.abs(r)).max()) < settled:
             break
         ratio = float(np.linalg.norm(r)) / max(float(np.linalg.norm(v)), 1e-300)
         further = min(max(1.0, ratio), _FURTHEST)
@@ -327,7 +331,8 @@ def reversible(counts: FloatArray) -> tuple[FloatArray, FloatArray] | None:
         good = bool(np.isfinite(jumped).all()) and np.abs(jumped - second).max() < _LONGEST_JUMP
         y = jumped if good else second
     else:
-        return None
+        if not float((np.exp(y) * np.abs(r)).max()) < 10.0 * _SETTLED:
+            return None
     w = out * np.exp(-y)
     flux = both / (w[:, None] + w[None])
     total = flux.sum(1)
@@ -383,7 +388,7 @@ def _draw(model: _Model, resampled: IntArray) -> tuple[FloatArray, FloatArray]:
     """Return populations `(n_draws, n)` and timescales `(n_draws, k)` of resampled replicas."""
     populations, times = [], []
     for multiplicity in resampled:
-        fitted = _fit(np.tensordot(multiplicity, model.by_unit, 1))
+        fitted = _fit(np.tensordot(multiplicity, model.by_unit, 1), _SETTLED)
         drawn = np.zeros(model.n)
         if fitted is None:
             populations.append(model.populations)

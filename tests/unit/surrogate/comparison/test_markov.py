@@ -181,7 +181,7 @@ def test_what_fits_nothing_is_left_out(
     """Lags or resampled replicas of which no matrix is found: by others the answer stands, by none it is a line."""
     calls, fit = [0], markov._fit
 
-    def sometimes(counts: np.ndarray) -> object:
+    def sometimes(counts: np.ndarray, settled: float = 0.0) -> object:
         calls[0] += 1
         return None if calls[0] % every == 0 else fit(counts)
 

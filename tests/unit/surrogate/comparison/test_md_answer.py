@@ -8,6 +8,7 @@ import math
 import numpy as np
 import pytest
 
+from surrogate.comparison import markov
 from surrogate.comparison import md_answer as told
 from surrogate.comparison.markov import equilibrium, with_prior
 from surrogate.comparison.md_answer import Answer, frames_over_states, md_answer
@@ -174,6 +175,19 @@ def test_a_surrogate_counts_for_less_the_more_md_has_seen(forms: np.ndarray) -> 
         shares.append((longer[2] - alone.populations[2], whole[2]))
     assert abs(shares[2][0]) < 0.01 < abs(shares[0][0]), "what MD sees often is MD's"
     assert shares[1][1] > 0.2, "negative control: counted whole the rollout outweighs MD"
+
+
+def test_a_draw_that_is_not_found_is_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As a draw without populations it would be an error of a third of every share."""
+    md, of_rollout = (list(jumps(SLOW, [0, 1, 2, 1] * 4, n, 2)) for n in (400, 2000))
+    alone, fit, calls = equilibrium(md), markov._fit, iter(range(1000))
+    monkeypatch.setattr(markov, "_fit", lambda *a: None if next(calls) % 5 == 4 else fit(*a))
+    found = with_prior(alone, md, of_rollout, crossings=12.5)
+    assert len(found.draws) == len(found.resampled) == 40
+    assert found.draws.sum(1) == pytest.approx(1.0)
+    monkeypatch.setattr(markov, "_fit", lambda *_: None)
+    with pytest.raises(InputError, match="no reversible Markov model"):
+        with_prior(alone, md, of_rollout, crossings=12.5)
 
 
 def test_a_visit_that_md_has_not_ended_is_no_trap(forms: np.ndarray) -> None:
