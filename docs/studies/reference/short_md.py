@@ -41,7 +41,7 @@ from systems.trajectory.checkpoint import checkpoint_path
 MOLECULES = {
     "GLN-ILE": ("sequence:ACE-GLN-ILE-NME", 40.0, 6.5, 4),
     "VAL-SER-GLU-PHE": ("sequence:ACE-VAL-SER-GLU-PHE-NME", 50.0, 3.5, 4),
-    "TYR-ASP": ("sequence:ACE-TYR-ASP-NME", 60.0, 6.0, 3),
+    "TYR-ASP": ("sequence:ACE-TYR-ASP-NME", 40.0, 6.0, 3),
 }
 WEIGHTS, ROLLED_PS, ROLLED, BATCHES = "peptides", 60e3, 8, 2
 EVERY_PS, LEFT_OUT_PS = 10.0, 20.0
