@@ -77,6 +77,11 @@ class StateEnergy:
     md_error: float | None = None
 
     @property
+    def is_known(self) -> bool:
+        """Whether its share is known: by MD, or by the surrogate's transitions where MD has none."""
+        return not self.missing if self.md_share is None else self.share > 0.0
+
+    @property
     def by_md(self) -> tuple[float, float]:
         """MD's own share and its error."""
         return (self.share, self.error) if self.md_share is None else (self.md_share, self.md_error or 0.0)
@@ -150,7 +155,7 @@ class Answer:
     @property
     def _weighed(self) -> list[StateEnergy]:
         """The states that have weights, of torsions that have two or more of these."""
-        known = [s for s in self.states if not s.missing]
+        known = [s for s in self.states if s.is_known]
         several = {t for t, n in Counter(s.torsion for s in known).items() if n > 1}
         return [s for s in known if s.torsion in several]
 
@@ -163,11 +168,12 @@ class Answer:
     def wants_surrogate(self) -> bool:
         """Whether a surrogate's transitions may make it better: MD has not converged, lacks states, or has large
         errors."""
-        both = [s for s in self.states if s.surrogate is not None and not s.missing]
-        if not both or self.is_reweighted:
+        rolled = [s for s in self.states if s.surrogate is not None]
+        if not rolled or self.is_reweighted:
             return False
-        error = math.sqrt(sum(s.error**2 for s in both) / len(both))
-        return not self.is_sure or bool(self.missing) or error > _BY_ITSELF * MODEL_ERROR
+        known = [s.error**2 for s in rolled if not s.missing]
+        enough = (_BY_ITSELF * MODEL_ERROR) ** 2 * len(known)
+        return not self.is_sure or bool(self.missing) or sum(known) > enough
 
     @property
     def contradicts(self) -> bool:
@@ -203,7 +209,8 @@ class Answer:
         length = f"{self.n_replicas} replicas of {format_time_ps(self.replica_ps, 2)}"
         length += ", each with its mirror image" * self.has_images
         if self.is_joint:
-            not_yet = f" and by itself off by up to {100 * max(s.by_md[1] for s in weighted):.2g} %"
+            off = 100 * max((s.by_md[1] for s in weighted if not s.missing), default=0.0)
+            not_yet = f" and by itself off by up to {off:.2g} %" if off else " and connects no states"
         else:
             not_yet = (
                 "" if self.is_sure else "; it has not converged" if self.is_reweighted else " and has not converged"
@@ -260,11 +267,10 @@ class Answer:
         """Return the states as lines of a name and a text."""
         lines = []
         for s in self.states:
-            told = s.share > 0.0 if s.md_share is not None else not s.missing
-            text = percent(s.share, s.error) if told else s.missing
-            if told and s.free_energy_kj_mol is not None and s.free_energy_kj_mol > 0.0:
+            text = percent(s.share, s.error) if s.is_known else s.missing
+            if s.is_known and s.free_energy_kj_mol is not None and s.free_energy_kj_mol > 0.0:
                 text += f", {s.free_energy_kj_mol:.1f} ± {s.free_energy_error or 0.0:.1f} kJ/mol"
-            if told and s.md_share is not None:
+            if s.is_known and s.md_share is not None:
                 text += f"; MD {s.missing or percent(*s.by_md)}"
             if s.surrogate is not None:
                 text += f"; surrogate {percent(s.surrogate, s.surrogate_error or 0.0)}{', differs' * s.differs}"

@@ -177,6 +177,16 @@ def test_a_surrogate_counts_for_less_the_more_md_has_seen(forms: np.ndarray) -> 
     assert shares[1][1] > 0.2, "negative control: counted whole the rollout outweighs MD"
 
 
+def test_where_md_connects_nothing_the_surrogate_alone_connects(forms: np.ndarray) -> None:
+    md = ensemble(forms, np.repeat([[0], [0], [1], [2]] * 4, 60, axis=1))
+    alone, joint = (md_answer(md, 300.0, surrogate=s) for s in (None, rolled(forms, MATRIX)))
+    assert alone.missing and alone.in_short[0].startswith("Do not use")
+    assert joint.is_joint and joint.missing and "For 3 states" in joint.in_short[1]
+    for s, p in zip(joint.states, POPULATIONS, strict=True):
+        assert abs(s.share - p) < 3.0 * s.error + 0.05 and s.is_known
+    assert "; MD not connected" in " ".join(text for _, text in joint.table())
+
+
 def test_a_draw_that_is_not_found_is_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
     """As a draw without populations it would be an error of a third of every share."""
     md, of_rollout = (list(jumps(SLOW, [0, 1, 2, 1] * 4, n, 2)) for n in (400, 2000))
