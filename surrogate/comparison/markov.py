@@ -38,7 +38,7 @@ _CK_TOLERANCE = 0.05
 _OUTLASTS, _LEFT_OUT = 20.0, 3.0
 _LEAST_UNITS = 8
 # Of a replica of a rollout that is a prior; a piece holds hardly more than one crossing.
-_PRIOR_PIECES, _LEAST_DRAWN = 32, 0.05
+_PRIOR_PIECES, _LEAST_DRAWN, _SLOW_LAGS = 32, 0.05, 5.0
 # Fewer transitions of the slowest process, in its rarer direction, tell no populations.
 _LEAST_CROSSINGS = 5
 # What has fewer frames than this share is not named as missing.
@@ -185,16 +185,17 @@ def with_prior(
     """Return the equilibrium of MD whose transitions count together with those of a surrogate's rollout.
 
     `micro`, `prior`: microstates of MD's frames, the same replicas as `found` is of, and of the rollout's, in one
-    numbering. The rollout's counts are scaled so that they are worth so many `crossings` of its slowest process, or
-    fewer where it saw fewer: a Dirichlet prior of transition probabilities. What MD sees often is MD's; what it hardly
-    sees is the surrogate's. Draws resample MD's replicas, and pieces of the rollout with weights of mean and variance
-    of that scale. Segments of the rollout stand behind MD's; their frames count where MD has none. Raises InputError
-    where no model fits.
+    numbering. The rollout's counts are scaled so that they are worth so many `crossings` of whichever of its five
+    slowest processes it saw most often, and fewer of the others: a Dirichlet prior of transition probabilities. By the
+    slowest, which may have been seen once, a long rollout would outweigh MD in all others. What MD sees often is MD's;
+    what it hardly sees is the surrogate's. Draws resample MD's replicas, and pieces of the rollout with weights of mean
+    and variance of that scale. Segments of the rollout stand behind MD's; their frames count where MD has none. Raises
+    InputError where no model fits.
     """
     n, lag = 1 + max(int(m.max()) for m in (*micro, *prior)), found.lag_frames
     of_md, of_prior = list(found.unit_of), _units(list(prior), lag, _PRIOR_PIECES)
     by_unit = np.concatenate([_counts(list(m), u, n, lag) for m, u in ((micro, of_md), (prior, of_prior))])
-    seen = _Model(list(prior), of_prior, n, lag).crossings(list(prior), len(prior))
+    seen = _Model(list(prior), of_prior, n, lag).most_crossings(list(prior))
     scale = min(1.0, crossings / max(seen, 1))
     rng = np.random.default_rng(seed)
     drawn = np.maximum(rng.gamma(scale, size=(len(found.resampled), len(of_prior))), _LEAST_DRAWN * scale)
@@ -375,8 +376,16 @@ class _Model:
             alike = [(of[m] == of[image]).mean() for m, image in zip(micro[:own], micro[own:], strict=False)]
             if not alike or np.mean(alike) > 0.5:
                 break
+        return self._crossed(of, micro[:own])
+
+    def most_crossings(self, micro: list[IntArray]) -> int:
+        """Return the same of whichever of the slow processes was seen most often; some lags are not slow."""
+        n_slow = max(1, int((self.times > _SLOW_LAGS * self.lag).sum()))
+        return max(self._crossed(of, micro) for of in self.sides[:n_slow])
+
+    def _crossed(self, of: IntArray, micro: list[IntArray]) -> int:
         ways = np.zeros(2, dtype=int)
-        for m in micro[:own]:
+        for m in micro:
             side = of[m[:: self.lag]]
             side = side[side >= 0]
             for way in (0, 1):
