@@ -64,8 +64,7 @@ class Equilibrium:
     `method`: how it was found; `lag_frames`: of the Markov model; `timescales`, `timescale_errors` `(k,)` in frames,
     descending; `flat`: whether the slowest is the same at a longer lag; `ck_error`: the largest difference between
     predicted and observed probabilities to be where one was (Chapman-Kolmogorov), `ck_holds` whether that is within
-    errors; `crossings`: how often the slowest process that populations depend on was seen, in the rarer direction: not
-    that between a replica and its image, which are as likely. `populations` `(n_micro,)`, 0
+    errors; `crossings`: how often the slowest process was seen, in the rarer direction. `populations` `(n_micro,)`, 0
     outside the connected set; `draws` `(n_draws, n_micro)` of a bootstrap over replicas, whose multiplicities are
     `resampled` `(n_draws, n_units)`; `unit_of` says for each unit which replica and which frames it is. `weights`: of
     every frame, one array a replica, mean 1 over all. `unconnected`: what has no weight. `n_own`: how many replicas are
@@ -125,17 +124,13 @@ def _spread(populations: FloatArray, weighted: FloatArray, counts: FloatArray) -
     return np.asarray(found / norm if norm > 0 else found)
 
 
-def equilibrium(
-    micro: Sequence[IntArray], *, lag: int | None = None, n_own: int | None = None, seed: int = 0
-) -> Equilibrium:
+def equilibrium(micro: Sequence[IntArray], *, lag: int | None = None, seed: int = 0) -> Equilibrium:
     """Return the equilibrium of MD replicas whose frames were put into microstates.
 
     `micro`: one array `(n_frames,)` a replica of microstates from 0, -1 for none, frames equally far apart; `lag`: in
-    frames, None for the shortest at which the slowest timescale is flat; `n_own`: how many of them are MD, the others
-    images of these that are as likely: they count, and are drawn with them. Where every replica is twenty times as long
-    as the slowest process, plain averages. Raises InputError where there is nothing to count.
+    frames, None for the shortest at which the slowest timescale is flat. Where every replica is twenty times as long as
+    the slowest process, plain averages. Raises InputError where there is nothing to count.
     """
-    own = sum(len(m) > 1 for m in micro[:n_own])
     micro = [np.asarray(m, dtype=np.int64) for m in micro if len(m) > 1]
     if not micro or max(m.max() for m in micro) < 0:
         raise InputError("there are no frames in any state, and so no equilibrium to tell; give longer replicas.")
@@ -143,10 +138,8 @@ def equilibrium(
     rng = np.random.default_rng(seed)
     longest = max(1, int(np.median([len(m) for m in micro])) // _LAGS_A_REPLICA)
     lags = [n for n in _LAGS if n <= longest] if lag is None else [lag]
-    images = len(micro) // own
-    units = _units(micro, lags[-1], -(-_LEAST_UNITS // own))
-    n_units = len(units) // images
-    resampled = np.tile(rng.multinomial(n_units, np.full(n_units, 1.0 / n_units), size=_N_DRAWS), images)
+    units = _units(micro, lags[-1], -(-_LEAST_UNITS // len(micro)))
+    resampled = rng.multinomial(len(units), np.full(len(units), 1.0 / len(units)), size=_N_DRAWS)
     models = []
     for n in lags:
         with suppress(InputError):
@@ -165,18 +158,34 @@ def equilibrium(
     lost = any(u.fate != "left and never entered" for u in unconnected)
     ck_error, ck_holds = _chapman_kolmogorov(model, micro, units, resampled[:20])
     found = Equilibrium(
-        "Markov model", model.lag, model.times, errors, flat, ck_error, ck_holds, model.crossings(micro, own),
-        model.populations, draws, resampled, tuple(units), (), unconnected, own,
+        "Markov model", model.lag, model.times, errors, flat, ck_error, ck_holds, model.crossings(micro),
+        model.populations, draws, resampled, tuple(units), (), unconnected, len(micro),
     )  # fmt: skip
     if n_frames.min() >= _OUTLASTS * slowest and not lost and found.crossings > 0:
         return _averaged(found, micro, round(_LEFT_OUT * slowest))
-    weights: list[FloatArray] = []
-    for k in range(0, len(micro), own):  # what is MD has the populations by itself
-        visits = sum(np.bincount(m[m >= 0], minlength=n_micro) for m in micro[k : k + own])
-        with np.errstate(divide="ignore", invalid="ignore"):
-            each = np.where(visits > 0, model.populations / visits, 0.0)
-        weights += [np.append(each, 0.0)[m] for m in micro[k : k + own]]
-    return replace(found, weights=with_mean_one(weights))
+    visits = sum(np.bincount(m[m >= 0], minlength=n_micro) for m in micro)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        each = np.append(np.where(visits > 0, model.populations / visits, 0.0), 0.0)
+    return replace(found, weights=with_mean_one([each[m] for m in micro]))
+
+
+def with_images(found: Equilibrium, micro: Sequence[IntArray], hands: Sequence[BoolArray]) -> Equilibrium:
+    """Return the same of replicas and, behind them, their mirror images, which are as likely.
+
+    `micro`: of frames that were brought to one hand; `hands`: which of them the replicas have in the other. An image is
+    in the microstate of its frame; frames of either hand, where there are both, weigh as much.
+    """
+    n = 2 * len(found.populations)
+    cells = [np.where(m < 0, n, 2 * m + h) for m, h in zip(micro, hands, strict=True)]
+    each = np.bincount(np.concatenate(cells), np.concatenate(found.weights), n + 1)[:n].reshape(-1, 2)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        factor = each.sum(1, keepdims=True) / (each * (each > 0).sum(1, keepdims=True))
+    factor = np.append(np.where(each > 0, factor, 0.0).ravel(), 0.0)
+    weights = tuple(w * factor[c] for w, c in zip(found.weights, cells, strict=True))
+    return replace(
+        found, unit_of=(*found.unit_of, *((k + len(micro), a, b) for k, a, b in found.unit_of)),
+        resampled=np.hstack([found.resampled] * 2), weights=weights * 2,
+    )  # fmt: skip
 
 
 def with_prior(
@@ -369,14 +378,9 @@ class _Model:
         self.sides[:, self.kept] = functions.T > 0 if functions.size else 0
         self.side = self.sides[0, :n]
 
-    def crossings(self, micro: list[IntArray], own: int) -> int:
-        """Return how often the slowest process is seen in its rarer direction, at steps of the lag, in the `own` first:
-        of those that do not tell these from the images behind them."""
-        for of in self.sides:
-            alike = [(of[m] == of[image]).mean() for m, image in zip(micro[:own], micro[own:], strict=False)]
-            if not alike or np.mean(alike) > 0.5:
-                break
-        return self._crossed(of, micro[:own])
+    def crossings(self, micro: list[IntArray]) -> int:
+        """Return how often the slowest process is seen in its rarer direction, at steps of the lag."""
+        return self._crossed(self.sides[0], micro)
 
     def most_crossings(self, micro: list[IntArray]) -> int:
         """Return the same of whichever of the slow processes was seen most often; some lags are not slow."""

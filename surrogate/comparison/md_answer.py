@@ -17,12 +17,18 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from surrogate.comparison.markov import Equilibrium, equilibrium, with_mean_one, with_prior
+from surrogate.comparison.markov import (
+    Equilibrium,
+    equilibrium,
+    with_images,
+    with_mean_one,
+    with_prior,
+)
 from surrogate.comparison.measure import kinetics
 from surrogate.comparison.measure.distributions import is_alpha
 from surrogate.comparison.measure.movie import pick_frames
 from surrogate.comparison.measure.slow_motion import SLOW_KINDS
-from surrogate.comparison.measure.statistics import FloatArray, IntArray
+from surrogate.comparison.measure.statistics import BoolArray, FloatArray, IntArray
 from surrogate.comparison.measure.structure import Backbone, backbone
 from surrogate.comparison.measure.torsions import Torsion, find_torsions, find_wells
 from surrogate.comparison.read.ensemble import Ensemble
@@ -314,6 +320,16 @@ class _Torsions:
         return out
 
 
+def _hands(angles: list[FloatArray]) -> list[BoolArray] | None:
+    """Return on which side of planar each frame is in the torsion that is furthest from planar; None where MD keeps a
+    torsion on one side, so that nothing says that the mirror image is the same molecule."""
+    every = np.concatenate(angles)
+    if not every.shape[1] or not ((every > 0).any(0) & (every < 0).any(0)).all():
+        return None
+    furthest = int(np.argmax(np.nanmean(np.abs(np.sin(every)), 0)))
+    return [a[:, furthest] < 0 for a in angles]
+
+
 def _is_its_mirror_image(scene: Scene) -> bool:
     """Return whether MD of a molecule reaches the mirror images of its frames, atom by atom: nothing keeps handedness,
     not even atoms with like neighbours, such as isopropyl's."""
@@ -333,7 +349,7 @@ def md_answer(
 
     `md`: one segment a replica; `temperature_k` of its bath; `factors`: what each frame counts at the law of a
     reference, exp(-(U_reference - U_model) / kT) up to a constant, NaN where the reference was not asked. Of a small
-    molecule that is its own mirror image each replica counts with its mirror image, as long as MD connects the two.
+    molecule that is its own mirror image each replica counts with its mirror image, where MD was on either side.
     Raises InputError where no torsion of the molecule turns, so that MD has nothing to weigh, or replicas are too short
     to tell anything.
     """
@@ -341,11 +357,13 @@ def md_answer(
     if not len(torsions.quads) and factors is None:
         raise InputError(f"{md.scene.name}: no torsion turns, and so there are no states to weigh.")
     of_md = torsions.of(md)
-    for angles in ([*of_md, *(-a for a in of_md)], of_md) if torsions.has_images else (of_md,):
-        micro = _microstates(angles, md.lag_ps)
-        found = equilibrium(micro, n_own=len(of_md), seed=seed)
-        if not found.unconnected:
-            break
+    hands = _hands(of_md) if torsions.has_images else None
+    angles = of_md if hands is None else [np.where(h[:, None], -a, a) for a, h in zip(of_md, hands, strict=True)]
+    micro = _microstates(angles, md.lag_ps)
+    found = equilibrium(micro, seed=seed)
+    if hands is not None:
+        found = with_images(found, micro, hands)
+        angles, micro = [*angles, *(-a for a in angles)], micro * 2
     counting = None if factors is None else [*factors] * (len(micro) // len(of_md))
     own = torsions.of(surrogate) if surrogate is not None else None
     states: list[StateEnergy] = []

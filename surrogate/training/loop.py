@@ -178,6 +178,8 @@ def load_tensors(path: Path, kind: str) -> tuple[dict[str, Any], dict[str, Tenso
 
 # Matrices with fewer rows or columns are no business of Muon's.
 LEAST_MATRIX = 8
+# Steps of a GPU between two looks at whether numbers are finite.
+GPU_STEPS = 20
 
 # generator of a batch's random numbers -> loss, and its parts by name
 LossFn = Callable[[torch.Generator], tuple[Tensor, dict[str, Tensor]]]
@@ -315,7 +317,10 @@ def run_stage(stage: Stage, place: StagePlace, *, progress: ProgressFn | None = 
         now = time.monotonic()
         spent_s, last = spent_s + now - last, now
         norm = nn.utils.clip_grad_norm_(module.parameters(), config.clip_norm)
-        if not torch.isfinite(norm):
+        ended = config.share_done(step + 1, spent_s) >= 1.0
+        validates = spent_s >= next_validation or ended
+        # A GPU is asked now and then, but before anything is saved: each question waits for it.
+        if (device.type == "cpu" or validates or step % GPU_STEPS == 0) and not torch.isfinite(norm):
             raise SimulationError(
                 f"training stage {config.name!r}: loss or gradient is not finite at step {step}; lower the learning "
                 f"rate (now {config.learning_rate:g}). The last good state is {place.state}."
@@ -324,11 +329,10 @@ def run_stage(stage: Stage, place: StagePlace, *, progress: ProgressFn | None = 
             optimiser.step()
         ema.update(module, step)
         for key, value in {**terms, "gradient_norm": norm.detach()}.items():
-            sums[key] = sums.get(key, torch.zeros(())) + value.float().cpu()
+            sums[key] = sums.get(key, torch.zeros_like(value, dtype=torch.float32)) + value.float()
         n_summed += 1
         step += 1
-        ended = config.share_done(step, spent_s) >= 1.0
-        if spent_s >= next_validation or ended:
+        if validates:
             next_validation = spent_s + config.validate_every_s
             with ema.swapped(module):
                 metrics = {f"train_{k}": float(v) / n_summed for k, v in sums.items()} | stage.validate()
@@ -390,6 +394,7 @@ def optimisers_of(module: nn.Module, config: StageConfig) -> list[torch.optim.Op
         [{"params": decay, "weight_decay": config.weight_decay}, {"params": plain, "weight_decay": 0.0}],
         lr=config.learning_rate,
         betas=(0.9, 0.99),
+        fused=any(p.is_cuda for p in others) or None,
     )
     if config.matrix_rate is None or not matrices:
         return [adam]

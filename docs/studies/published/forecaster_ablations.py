@@ -244,12 +244,16 @@ def train(path: Path, method: str, task: str, given: argparse.Namespace) -> Gene
                 sums += 100.0 * wrong.square().mean((2, 3, 4)).sum(1)
         return sums / len(windows.x)
 
+    def learning(x: Tensor, v: Tensor) -> Tensor:
+        return of_seeds(x, v, apart=True)
+
+    forward = torch.compile(learning, fullgraph=True, dynamic=False) if device == "cuda" else learning
     rows = torch.zeros(given.seeds, given.batch, dtype=torch.int64, device=device)
     adam = torch.optim.Adam(weights.values(), lr=given.rate, capturable=device == "cuda")
 
     def step() -> None:
         adam.zero_grad(set_to_none=True)
-        wrong = of_seeds(learned.x[rows], learned.v[rows], apart=True) - learned.future[rows]
+        wrong = forward(learned.x[rows], learned.v[rows]) - learned.future[rows]
         (wrong.square().mean((1, 2, 3, 4)).sum() / moved_nm**2).backward()
         # The decoder's last update of embeddings and its velocities are of no use here.
         for gradient in (p.grad for p in weights.values() if p.grad is not None):

@@ -16,7 +16,7 @@ from torch import Tensor
 sys.path.append(str(Path(__file__).parents[1] / "training"))
 from recorded import Recorded
 
-from surrogate.models.lam_slide.model import LamSlide
+from surrogate.models.lam_slide.model import LamSlide, LatentLayer
 from surrogate.models.lam_slide.trainer import (
     autoencoder_loss,
     draw_flow_times,
@@ -263,24 +263,26 @@ def train_lam_slide_on_windows(
     normalise_latents(model, drawn)
     model.autoencoder.requires_grad_(False)
 
-    def flow_of(module: LamSlide, x: Tensor, kinds: Tensor, tau: Tensor, noise: Tensor) -> Tensor:
+    def flow_of(module: LamSlide, x: Tensor, kinds: Tensor, tau: Tensor) -> Tensor:
         with torch.no_grad(), torch.autocast(device.type, enabled=False):
             latents = encode_windows(module, x, kinds)
+        noise = torch.randn_like(latents)
         # What a graph repeats may not keep casts of weights from one step to the next.
         with torch.autocast(device.type, torch.bfloat16, cache_enabled=False):
             return flow_loss(module, latents, x.shape[2], tau, torch.Generator(), noise=noise)[0]
 
     recorded: list[Recorded] = []
-    c, plain = model.config.autoencoder, model.config.approximator.position_weight == 0.0
+    plain = model.config.approximator.position_weight == 0.0
 
     def stage_two(generator: torch.Generator) -> tuple[Tensor, dict[str, Tensor]]:
         x, kinds = drawn(two.batch, generator)
         tau = draw_flow_times(model, two.batch, generator).to(device)
         if device.type == "cuda" and plain:
-            noise = torch.randn(*x.shape[:2], c.n_latents, c.latent_dim, generator=generator).to(device)
+            # Noise is drawn on the GPU, by a seed of each step.
+            torch.cuda.manual_seed(int(torch.randint(2**62, (1,), generator=generator)))
             if not recorded:
-                recorded.append(Recorded(model, flow_of, (x, kinds, tau, noise)))
-            loss = recorded[0](x, kinds, tau, noise)
+                recorded.append(Recorded(model, flow_of, (x, kinds, tau), compiled=(LatentLayer,)))
+            loss = recorded[0](x, kinds, tau)
             return loss, {"flow": loss.detach()}
         with torch.no_grad(), torch.autocast(device.type, enabled=False):
             latents = encode_windows(model, x, kinds)

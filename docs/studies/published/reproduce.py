@@ -80,9 +80,10 @@ def _settings(chosen: argparse.Namespace, of_molecules: bool) -> Settings:
     steps = chosen.steps
     if (chosen.paper_size or chosen.paper_form) and not of_molecules and steps is None:
         steps = forecaster_training.PAPER_STEPS
+    budget = chosen.budget or ("10min" if steps is None else None)
     settings = Settings(
         folder=chosen.out or Path(f"surromd-{chosen.task}"),
-        budget_s=None if steps is not None else parse_wall_s(chosen.budget, "--budget"),
+        budget_s=None if budget is None else parse_wall_s(budget, "--budget"),
         steps=steps,
         call_s=None if chosen.call is None else parse_wall_s(chosen.call, "--call"),
         paper_size=chosen.paper_size,
@@ -106,8 +107,8 @@ def _parser() -> argparse.ArgumentParser:
     add = parser.add_argument
     add("task", help="n-body-charged, n-body-spring, n-body-gravity or md17")
     add("-o", "--out", type=Path, help="folder of data and results [surromd-TASK]")
-    add("--budget", default="10min", help="wall time of each method's training")
-    add("--steps", type=int, help="optimiser steps instead of a budget")
+    add("--budget", help="wall time of each method's training [10min; none where steps are given]")
+    add("--steps", type=int, help="optimiser steps, at most as many as the budget allows")
     add("--method", action="append", help="only this; may be repeated")
     add("--train", type=int, help="trajectories (md17: windows of each molecule) instead of the published number")
     add("--validation", type=int, help="the same [a tenth of the test's; md17: as the test's]")

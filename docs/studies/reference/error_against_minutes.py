@@ -1,6 +1,6 @@
 """Error of the final answer against minutes: `surromd run`, MD from one start, MD from many, a rollout alone.
 
-    python docs/studies/reference/error_against_minutes.py reference FOLDER [--time 140ns]
+    python docs/studies/reference/error_against_minutes.py reference FOLDER [--time 140ns --every 50ps]
     python docs/studies/reference/error_against_minutes.py runs FOLDER [--minutes 1 3 10]
     python docs/studies/reference/error_against_minutes.py rivals FOLDER [--minutes 10]
     python docs/studies/reference/error_against_minutes.py table FOLDER [-o TABLE.json] [--figure FIGURE.svg]
@@ -79,7 +79,7 @@ LONG_ENOUGH = 0.9
 ROLLED_MINUTES = 1.0
 
 
-def make_reference(folder: Path, names: Sequence[str], time_ps: float | None) -> None:
+def make_reference(folder: Path, names: Sequence[str], time_ps: float | None, every_ps: float) -> None:
     """Make the reference of every molecule, by default as long as its slowest process needs."""
     for name in names:
         source, ns = MOLECULES[name]
@@ -88,7 +88,7 @@ def make_reference(folder: Path, names: Sequence[str], time_ps: float | None) ->
         files = [folder / name / f"run_{k:03d}.h5" for k in range(n_replicas())]
         files[0].parent.mkdir(parents=True, exist_ok=True)
         length_ps = 1e3 * ns if time_ps is None else time_ps
-        options = ReferenceOptions(time_ps=length_ps, save_every_ps=EVERY_PS, seed=SEED, platform="simd", quiet=True)
+        options = ReferenceOptions(time_ps=length_ps, save_every_ps=every_ps, seed=SEED, platform="simd", quiet=True)
         scene, config, _ = resolve_run(prepare(source), options, {"time_ps": length_ps}, quiet=True)
         simulate_replicas(scene, config, files, resume=True)
         said(f"{name}: {len(files)} replicas of {format_time_ps(length_ps)}")
@@ -477,13 +477,14 @@ def main() -> None:
         part.add_argument("folder", type=Path)
         part.add_argument("--molecules", nargs="+", choices=sorted(MOLECULES), default=list(MOLECULES))
     parts["reference"].add_argument("--time", type=lambda text: parse_time_ps(text, "--time"))
+    parts["reference"].add_argument("--every", type=lambda text: parse_time_ps(text, "--every"), default=EVERY_PS)
     parts["runs"].add_argument("--minutes", nargs="+", type=float, default=[1.0, 3.0, 10.0])
     parts["rivals"].add_argument("--minutes", type=float, default=10.0)
     parts["table"].add_argument("-o", "--out", type=Path)
     parts["table"].add_argument("--figure", type=Path)
     given = parser.parse_args()
     if given.verb == "reference":
-        make_reference(given.folder, given.molecules, given.time)
+        make_reference(given.folder, given.molecules, given.time, given.every)
     elif given.verb == "runs":
         make_runs(given.folder, given.molecules, given.minutes)
     elif given.verb == "rivals":

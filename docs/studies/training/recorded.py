@@ -13,15 +13,22 @@ from torch import Tensor, nn
 class Recorded:
     """`loss_of(module, *inputs)` for inputs of fixed shapes, computed by a copy of the module that shares its tensors,
     so that nothing else that uses the module is part of the graph. All tensors are on the GPU and no number is read
-    from them inside; the module's tensors may change in place."""
+    from them inside; the module's tensors may change in place. Modules of the kinds `compiled` go through torch's
+    compiler first."""
 
-    def __init__(self, module: nn.Module, loss_of: Callable[..., Tensor], inputs: Sequence[Tensor]) -> None:
+    def __init__(
+        self, module: nn.Module, loss_of: Callable[..., Tensor], inputs: Sequence[Tensor],
+        compiled: tuple[type[nn.Module], ...] = (),
+    ) -> None:  # fmt: skip
         self.inputs = [t.clone() for t in inputs]
         self.parameters = [p for p in module.parameters() if p.requires_grad]
         twin = copy.deepcopy(module)
         for own, others in ((twin.parameters(), module.parameters()), (twin.buffers(), module.buffers())):
             for tensor, other in zip(own, others, strict=True):
                 tensor.data = other.data
+        for part in twin.modules():
+            if isinstance(part, compiled):
+                part.compile(dynamic=False)
         learned = [p for p in twin.parameters() if p.requires_grad]
 
         def compute() -> tuple[Tensor, Sequence[Tensor | None]]:

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from surrogate.comparison import markov
-from surrogate.comparison.markov import equilibrium, reversible
+from surrogate.comparison.markov import equilibrium, reversible, with_images
 from systems.errors import InputError
 
 # Three states in a row, of populations .6, .3 and .1; a jump in some 200 frames.
@@ -164,14 +164,18 @@ def test_what_images_are_known_to_balance_need_not_be_seen_often() -> None:
         [[0.95, 0.05, 0.0, 0.0], [0.1, 0.899, 0.001, 0.0], [0.0, 0.001, 0.899, 0.1], [0.0, 0.0, 0.05, 0.95]]
     )
     micro = run(matrix, [0, 1] * 6, 200, 1)
-    alone, both = equilibrium(micro), equilibrium([*micro, *(3 - m for m in micro)], n_own=len(micro))
+    alone, one = equilibrium(micro), [np.minimum(m, 3 - m) for m in micro]
+    both = with_images(equilibrium(one), one, [m > 1 for m in micro])
     assert alone.unconnected and not both.unconnected, "negative control"
     assert both.holds and both.crossings > 50 and both.n_own == len(micro)
-    assert np.abs(both.populations - np.array([1 / 3, 1 / 6, 1 / 6, 1 / 3])).max() < 0.04
-    assert (both.draws[:, 0] - both.draws[:, 3]).std() < 0.02
+    right = np.array([1 / 3, 1 / 6, 1 / 6, 1 / 3])
+    assert np.abs(both.populations - 2 * right[:2]).max() < 0.04
+    shares, draws = both.shares(one * 2, [*micro, *(3 - m for m in micro)], 4)
+    assert np.abs(shares - right).max() < 0.02 and shares[[0, 1]] == pytest.approx(shares[[3, 2]])
+    assert draws[:, 0] == pytest.approx(draws[:, 3]) and draws[:, 0].std() > 0.002
     # Frames of MD have these populations by their weights.
     weighted = np.bincount(np.concatenate(micro), np.concatenate(both.weights[: both.n_own]), minlength=4)
-    assert weighted / weighted.sum() == pytest.approx(both.populations, abs=1e-6)
+    assert weighted / weighted.sum() == pytest.approx(shares, abs=1e-6)
 
 
 @pytest.mark.parametrize("every", [7, 2, 1])

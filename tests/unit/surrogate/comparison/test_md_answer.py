@@ -376,9 +376,9 @@ def test_what_keeps_its_hand_atom_by_atom(smiles: str, is_own_image: bool) -> No
     assert told._is_its_mirror_image(prepare(f"smiles:{smiles}")) is is_own_image
 
 
-def chairs(n_turned: int) -> Ensemble:
+def chairs(n_turned: int, smiles: str = "CC1CCCCC1") -> Ensemble:
     """Twelve replicas of methylcyclohexane, so many of them in the other chair than the rest."""
-    scene, rng = prepare("smiles:CC1CCCCC1"), np.random.default_rng(2)
+    scene, rng = prepare(f"smiles:{smiles}"), np.random.default_rng(2)
     forms = ring_conformers(scene)
     x = np.stack([forms[int(k < n_turned)] for k in range(12)])[:, None].repeat(60, axis=1)
     return Ensemble("MD", list((x + rng.normal(0, 0.004, x.shape)).astype(np.float32)), 1.0, scene)
@@ -391,6 +391,16 @@ def test_a_chair_that_never_turns_over_is_not_connected() -> None:
     assert answer.in_short[0] == "Do not use MD's populations yet." and not answer.is_sure
     assert "0.0" not in answer.in_short[1], "what one state is alone with is known to no error"
     assert md_answer(chairs(0), 300.0).is_sure, "control"
+
+
+def test_chairs_that_are_mirror_images_are_as_likely() -> None:
+    answer = md_answer(chairs(4, "O1CCOCC1"), 300.0)
+    assert answer.is_sure and not answer.missing and answer.has_images
+    assert [s.share for s in answer.states] == pytest.approx([0.5, 0.5], abs=1e-9)
+    assert [s.n_replicas for s in answer.states] == [12, 12] == [s.n_begun for s in answer.states]
+    assert len(answer.weights) == 12 and np.mean(np.concatenate(answer.weights)) == pytest.approx(1.0)
+    one = md_answer(chairs(0, "O1CCOCC1"), 300.0)
+    assert not one.has_images and not one.states, "negative control: nothing says that the other chair is the same"
 
 
 def test_a_molecule_without_torsions_is_one_line() -> None:
