@@ -320,14 +320,25 @@ class _Torsions:
         return out
 
 
-def _hands(angles: list[FloatArray]) -> list[BoolArray] | None:
-    """Return on which side of planar each frame is in the torsion that is furthest from planar; None where MD keeps a
-    torsion on one side, so that nothing says that the mirror image is the same molecule."""
+def _hands(angles: list[FloatArray], lag_ps: float) -> list[BoolArray] | None:
+    """Return of which hand each frame is: on which side of zero in the slowest of all sums of torsions' sines (TICA),
+    so that of what turns more slowly than the hand changes nothing is lost; None where MD keeps a torsion on one side
+    of planar, so that nothing says that the mirror image is the same molecule."""
+    from scipy.linalg import eigh
+
     every = np.concatenate(angles)
     if not every.shape[1] or not ((every > 0).any(0) & (every < 0).any(0)).all():
         return None
-    furthest = int(np.argmax(np.nanmean(np.abs(np.sin(every)), 0)))
-    return [a[:, furthest] < 0 for a in angles]
+    sines = [np.nan_to_num(np.sin(a)) for a in angles]
+    lag = _tica_lag(angles, lag_ps)
+    now, later = (np.concatenate(x) for x in ([s[:-lag] for s in sines], [s[lag:] for s in sines]))
+    both, within = now.T @ later, now.T @ now + later.T @ later
+    slowest = eigh(both + both.T, within + 1e-6 * np.trace(within) * np.eye(len(within)))[1][:, -1]
+    return [s @ slowest < 0 for s in sines]
+
+
+def _tica_lag(angles: Sequence[FloatArray], lag_ps: float) -> int:
+    return max(1, min(round(_TICA_LAG_PS / lag_ps), min(map(len, angles)) // 4))
 
 
 def _is_its_mirror_image(scene: Scene) -> bool:
@@ -357,7 +368,7 @@ def md_answer(
     if not len(torsions.quads) and factors is None:
         raise InputError(f"{md.scene.name}: no torsion turns, and so there are no states to weigh.")
     of_md = torsions.of(md)
-    hands = _hands(of_md) if torsions.has_images else None
+    hands = _hands(of_md, md.lag_ps) if torsions.has_images else None
     angles = of_md if hands is None else [np.where(h[:, None], -a, a) for a, h in zip(of_md, hands, strict=True)]
     micro = _microstates(angles, md.lag_ps)
     found = equilibrium(micro, seed=seed)
@@ -493,9 +504,7 @@ def _microstates(
     if not angles[0].shape[1]:
         return [np.zeros(len(a), dtype=np.int64) for a in (*angles, *beside)]
     features = [kinetics.circular_features(a) for a in angles]
-    shortest = min(map(len, features))
-    lag = max(1, min(round(_TICA_LAG_PS / lag_ps), shortest // 4))
-    projection = kinetics.fit_projection(features, lag, _DIMENSIONS, least=0.05)
+    projection = kinetics.fit_projection(features, _tica_lag(angles, lag_ps), _DIMENSIONS, least=0.05)
     if projection is None:
         raise InputError("MD's replicas are too short to tell states apart; give them more time.")
     coordinates = [projection.project(x) for x in (*features, *(kinetics.circular_features(a) for a in beside))]

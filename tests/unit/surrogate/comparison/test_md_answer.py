@@ -352,6 +352,18 @@ def test_a_molecule_that_is_its_own_mirror_image_has_either_hand_alike(monkeypat
     assert abs(plus - minus) > 0.1 and not control.has_images, "negative control"
 
 
+def test_the_hand_is_that_of_what_turns_most_slowly() -> None:
+    """By a torsion that turns quickly, the side of a slow one beside another would be forgotten with every turn."""
+    flip = lambda p, seed: jumps(np.array([[1 - p, p], [p, 1 - p]]), [0, 1] * 4, 400, seed)  # noqa: E731
+    fast, slow = 2.0 * flip(0.3, 1) - 1.0, 2.0 * flip(0.01, 2) - 1.0
+    angles = [np.stack([1.57 * f, 0.8 * s], 1) for f, s in zip(fast, slow, strict=True)]
+    hands = told._hands(angles, 10.0)
+    assert hands is not None
+    alike = float(np.mean([h == (s < 0) for h, s in zip(hands, slow, strict=True)]))
+    assert min(alike, 1.0 - alike) < 0.01
+    assert told._hands([np.abs(a) for a in angles], 10.0) is None, "negative control: never on the other side"
+
+
 def test_a_hand_that_md_never_changes_is_not_the_other() -> None:
     """An axis that does not turn: its mirror image is another molecule, whatever its atoms say."""
     states = jumps(np.array([[0.9, 0.1], [0.1, 0.9]]), [0, 1] * 6, 60, 3)
