@@ -314,7 +314,9 @@ def outcome(
     if evaluated.equivalent_time_words:
         found = next((each for each in evaluated.equivalent_time if each.kind == "distribution"), None)
     rolled, speed_up = _length([evaluated.summary]), None
-    said = f"{rolled} of the surrogate" if way != "md" else f"{rolled} of MD, evaluated by {_length(held)}"
+    said = f"{rolled} of the surrogate"
+    if way == "md":
+        said = f"All frames counted alike, {rolled} of MD evaluated by {_length(held)}"
     if by_itself:
         said += f", compared with {_length(held)} of the same rollout: {evaluated.status}."
     elif found is None:

@@ -297,7 +297,7 @@ def test_md_claims_no_speed_up() -> None:
     found = told("md", equivalent_time())
     assert found.speed_up is None
     assert found.details.startswith(
-        "16 replicas of 3.1 ns of MD, evaluated by 32 replicas of 380 ps: equivalent to 10 ns"
+        "All frames counted alike, 16 replicas of 3.1 ns of MD evaluated by 32 replicas of 380 ps: equivalent to 10 ns"
     )
     assert "of the surrogate: undecided, without an equivalent MD time." in told("rollout", None).details
 
