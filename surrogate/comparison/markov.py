@@ -3,11 +3,13 @@
 Replicas that are shorter than the slowest relaxation remember where they began, so their plain averages are wrong; the
 transitions between states are not. A reversible maximum-likelihood Markov model turns transition counts into
 stationary populations, and these into a weight for every frame (Prinz et al., J. Chem. Phys. 134, 174105 (2011)).
-Nothing is invented: what transitions do not connect in both directions gets no weight and is named.
+Where they are few, plain averages count beside them. Nothing is invented: what transitions do not connect in both
+directions gets no weight and is named.
 """
 
 from __future__ import annotations
 
+import copy
 import math
 import warnings
 from collections.abc import Sequence
@@ -39,6 +41,8 @@ _OUTLASTS, _LEFT_OUT = 20.0, 3.0
 _LEAST_UNITS = 8
 # Of a replica of a rollout that is a prior; a piece holds hardly more than one crossing.
 _PRIOR_PIECES, _LEAST_DRAWN, _SLOW_LAGS = 32, 0.05, 5.0
+# What averages over frames of connected states count for beside transitions: crossings of a slow process at most.
+_AVERAGES_CROSSINGS = 4.0
 # Fewer transitions of the slowest process, in its rarer direction, tell no populations.
 _LEAST_CROSSINGS = 5
 # What has fewer frames than this share is not named as missing.
@@ -148,7 +152,16 @@ def equilibrium(micro: Sequence[IntArray], *, lag: int | None = None, seed: int 
         raise InputError("no reversible Markov model fits the transitions; give longer replicas.")
     chosen, flat = _choose(models, resampled)
     model = models[chosen]
-    draws, times = _draw(model, resampled)
+    times = _drawn_times(model, resampled)
+    averages = _Averages(model, micro, units)
+
+    def found_by(multiplicity: FloatArray, averages: _Averages, settled: float = _SETTLED) -> FloatArray:
+        counts = averages.beside(np.tensordot(multiplicity, model.by_unit, 1), multiplicity)
+        fitted = _fit(counts, settled)
+        return model.populations if fitted is None else np.asarray(np.bincount(fitted[2], fitted[1], n_micro), float)
+
+    populations = found_by(np.ones(len(units)), averages, 0.0)
+    draws = np.array([found_by(m, averages.shifted(rng)) for m in resampled])
     with warnings.catch_warnings():  # of a process that is in no draw
         warnings.simplefilter("ignore", RuntimeWarning)
         errors = np.nanstd(times, axis=0, ddof=1)
@@ -159,13 +172,13 @@ def equilibrium(micro: Sequence[IntArray], *, lag: int | None = None, seed: int 
     ck_error, ck_holds = _chapman_kolmogorov(model, micro, units, resampled[:20])
     found = Equilibrium(
         "Markov model", model.lag, model.times, errors, flat, ck_error, ck_holds, model.crossings(micro),
-        model.populations, draws, resampled, tuple(units), (), unconnected, len(micro),
+        populations, draws, resampled, tuple(units), (), unconnected, len(micro),
     )  # fmt: skip
     if n_frames.min() >= _OUTLASTS * slowest and not lost and found.crossings > 0:
         return _averaged(found, micro, round(_LEFT_OUT * slowest))
     visits = sum(np.bincount(m[m >= 0], minlength=n_micro) for m in micro)
     with np.errstate(divide="ignore", invalid="ignore"):
-        each = np.append(np.where(visits > 0, model.populations / visits, 0.0), 0.0)
+        each = np.append(np.where(visits > 0, populations / visits, 0.0), 0.0)
     return replace(found, weights=with_mean_one([each[m] for m in micro]))
 
 
@@ -210,10 +223,16 @@ def with_prior(
     drawn = np.maximum(rng.gamma(scale, size=(len(found.resampled), len(of_prior))), _LEAST_DRAWN * scale)
     multiplicity = np.hstack([found.resampled, drawn])
     n_md = len(of_md)
+    averages = None
+    with suppress(InputError):
+        averages = _Averages(_Model(list(micro), of_md, n, lag), list(micro), of_md)
 
     def populations(each: FloatArray, settled: float = _SETTLED) -> FloatArray | None:
         md, rolled = (np.tensordot(each[part], by_unit[part], 1) for part in (slice(n_md), slice(n_md, None)))
-        fitted = _fit(_ended(md) + rolled, settled)
+        both = _ended(md) + rolled
+        if averages is not None:
+            both = (averages.shifted(rng) if settled else averages).beside(both, each[:n_md])
+        fitted = _fit(both, settled)
         if fitted is None:
             return None
         out = np.zeros(n)
@@ -384,8 +403,12 @@ class _Model:
 
     def most_crossings(self, micro: list[IntArray]) -> int:
         """Return the same of whichever of the slow processes was seen most often; some lags are not slow."""
-        n_slow = max(1, int((self.times > _SLOW_LAGS * self.lag).sum()))
-        return max(self._crossed(of, micro) for of in self.sides[:n_slow])
+        return max(self._crossed(of, micro) for of in self.slow_sides)
+
+    @property
+    def slow_sides(self) -> IntArray:
+        """The sides of slow processes, at least of the slowest."""
+        return self.sides[: max(1, int((self.times > _SLOW_LAGS * self.lag).sum()))]
 
     def _crossed(self, of: IntArray, micro: list[IntArray]) -> int:
         ways = np.zeros(2, dtype=int)
@@ -397,24 +420,43 @@ class _Model:
         return int(ways.min())
 
 
-def _draw(model: _Model, resampled: IntArray) -> tuple[FloatArray, FloatArray]:
-    """Return populations `(n_draws, n)` and timescales `(n_draws, k)` of resampled replicas."""
-    populations, times = [], []
-    for multiplicity in resampled:
-        fitted = _fit(np.tensordot(multiplicity, model.by_unit, 1), _SETTLED)
-        drawn = np.zeros(model.n)
-        if fitted is None:
-            populations.append(model.populations)
-            times.append(np.full(len(model.times), np.nan))
-            continue
-        matrix, stationary, kept = fitted
-        drawn[kept] = stationary
-        populations.append(drawn)
-        found = np.full(len(model.times), np.nan)
-        own = _timescales(matrix, stationary, model.lag)[0][: len(found)]
-        found[: len(own)] = own
-        times.append(found)
-    return np.array(populations), np.array(times).reshape(len(times), len(model.times))
+def _drawn_times(model: _Model, resampled: IntArray) -> FloatArray:
+    """Return timescales `(n_draws, k)` of resampled replicas."""
+    times = np.full((len(resampled), len(model.times)), np.nan)
+    for row, multiplicity in zip(times, resampled, strict=True):
+        if (fitted := _fit(np.tensordot(multiplicity, model.by_unit, 1), _SETTLED)) is not None:
+            own = _timescales(fitted[0], fitted[1], model.lag)[0][: len(row)]
+            row[: len(own)] = own
+    return times
+
+
+class _Averages:
+    """Averages over frames of MD as transitions from anywhere to anywhere, in proportion to the frames.
+
+    Where a process was seen a few times, its transitions tell populations worse than averages over frames do. So many
+    count beside them, within the connected set, that no slow process gains more than a few crossings. What these leave
+    open is in `draws`: averages are shifted along each process.
+    """
+
+    def __init__(self, model: _Model, micro: list[IntArray], units: Sequence[tuple[int, int, int]]) -> None:
+        self.slow, self.lag = model.slow_sides[:, :-1], model.lag
+        parts = [micro[k][a:b] for k, a, b in units]
+        self.visits = np.array([np.bincount(m[m >= 0], minlength=model.n) for m in parts])
+        self.shift = np.zeros(len(self.slow))
+
+    def shifted(self, rng: np.random.Generator) -> _Averages:
+        found = copy.copy(self)
+        found.shift = math.sqrt(2.0 / _AVERAGES_CROSSINGS) * rng.normal(size=len(self.slow))
+        return found
+
+    def beside(self, counts: FloatArray, multiplicity: FloatArray) -> FloatArray:
+        """Return counts `(n, n)` of the connected set with what the averages of so many of each unit add."""
+        inside = _components(counts) == 0
+        share = np.where(inside, multiplicity @ self.visits * np.exp(self.shift @ (self.slow > 0)), 0.0)
+        share /= max(share.sum(), 1e-300)
+        either = [share[side == 0].sum() * share[side == 1].sum() for side in self.slow]
+        added = _AVERAGES_CROSSINGS * self.lag / max(*either, 0.05)
+        return np.where(inside[:, None] & inside, counts, 0.0) + added * np.outer(share, share)
 
 
 def _choose(models: list[_Model], resampled: IntArray) -> tuple[int, bool]:
@@ -426,7 +468,7 @@ def _choose(models: list[_Model], resampled: IntArray) -> tuple[int, bool]:
     if len(models) == 1:
         return 0, True
     slowest = [_log_slowest(m.times[None]) for m in models]
-    drawn = [_log_slowest(_draw(m, resampled[:_FLAT_DRAWS])[1]) for m in models]
+    drawn = [_log_slowest(_drawn_times(m, resampled[:_FLAT_DRAWS])) for m in models]
     for k, model in enumerate(models[:-1]):
         # A process as fast as the lag cannot be followed any longer.
         if not slowest[k][0] >= math.log(model.lag):

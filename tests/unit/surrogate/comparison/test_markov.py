@@ -56,6 +56,24 @@ def test_errors_hold_as_often_as_they_say() -> None:
     assert np.mean(inside) > 0.85
 
 
+def test_averages_count_where_transitions_are_few_and_only_there(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Replicas that begin in nearly the right proportions and hardly ever change state."""
+    starts = np.repeat([0, 1, 2], [18, 10, 4]).tolist()
+
+    def errors(n_frames: int) -> list[float]:
+        found = [equilibrium(run(chain(), starts, n_frames, seed), lag=5).populations for seed in range(12)]
+        return [float(np.sqrt(np.mean(np.square(p - POPULATIONS)))) for p in found]
+
+    few, many = errors(60), errors(3000)
+    monkeypatch.setattr(markov, "_AVERAGES_CROSSINGS", 0.01)
+    assert np.mean(few) < 0.75 * np.mean(errors(60))
+    assert np.mean(many) == pytest.approx(np.mean(errors(3000)), rel=0.2)
+    # What is not connected has no weight, whatever its frames.
+    monkeypatch.undo()
+    alone = equilibrium([*run(chain(POPULATIONS[:2]), [0, 1] * 8, 400), *run(np.eye(3), [2] * 4, 400)])
+    assert alone.populations[2] == 0.0 and alone.unconnected[0].fate == "only begun in"
+
+
 def test_weights_give_the_populations_and_have_mean_one() -> None:
     micro = run(chain(), [2] * 32, 300)
     found = equilibrium(micro)
