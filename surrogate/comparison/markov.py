@@ -434,8 +434,8 @@ class _Averages:
     """Averages over frames of MD as transitions from anywhere to anywhere, in proportion to the frames.
 
     Where a process was seen a few times, its transitions tell populations worse than averages over frames do. So many
-    count beside them, within the connected set, that no slow process gains more than a few crossings. What these leave
-    open is in `draws`: averages are shifted along each process.
+    count beside them, within the connected set, that no slow process gains more than a few crossings. `shifted` draws
+    what these leave open.
     """
 
     def __init__(self, model: _Model, micro: list[IntArray], units: Sequence[tuple[int, int, int]]) -> None:
@@ -445,6 +445,7 @@ class _Averages:
         self.shift = np.zeros(len(self.slow))
 
     def shifted(self, rng: np.random.Generator) -> _Averages:
+        """Return averages moved at random along each slow process, by as much as so few crossings are off."""
         found = copy.copy(self)
         found.shift = math.sqrt(2.0 / _AVERAGES_CROSSINGS) * rng.normal(size=len(self.slow))
         return found
