@@ -186,7 +186,8 @@ def with_images(found: Equilibrium, micro: Sequence[IntArray], hands: Sequence[B
     """Return the same of replicas and, behind them, their mirror images, which are as likely.
 
     `micro`: of frames that were brought to one hand; `hands`: which of them the replicas have in the other. An image is
-    in the microstate of its frame; frames of either hand, where there are both, weigh as much.
+    in the microstate of its frame; frames of either hand, where there are both, weigh as much, and so do all frames of
+    either hand, also where some microstates were seen in one alone.
     """
     n = 2 * len(found.populations)
     cells = [np.where(m < 0, n, 2 * m + h) for m, h in zip(micro, hands, strict=True)]
@@ -195,9 +196,12 @@ def with_images(found: Equilibrium, micro: Sequence[IntArray], hands: Sequence[B
         factor = each.sum(1, keepdims=True) / (each * (each > 0).sum(1, keepdims=True))
     factor = np.append(np.where(each > 0, factor, 0.0).ravel(), 0.0)
     weights = tuple(w * factor[c] for w, c in zip(found.weights, cells, strict=True))
+    either = np.bincount(np.concatenate(hands), np.concatenate(weights), 2)
+    if (either > 0).all():
+        weights = tuple(w / either[h.astype(int)] for w, h in zip(weights, hands, strict=True))
     return replace(
         found, unit_of=(*found.unit_of, *((k + len(micro), a, b) for k, a, b in found.unit_of)),
-        resampled=np.hstack([found.resampled] * 2), weights=weights * 2,
+        resampled=np.hstack([found.resampled] * 2), weights=with_mean_one(weights) * 2,
     )  # fmt: skip
 
 
@@ -223,16 +227,10 @@ def with_prior(
     drawn = np.maximum(rng.gamma(scale, size=(len(found.resampled), len(of_prior))), _LEAST_DRAWN * scale)
     multiplicity = np.hstack([found.resampled, drawn])
     n_md = len(of_md)
-    averages = None
-    with suppress(InputError):
-        averages = _Averages(_Model(list(micro), of_md, n, lag), list(micro), of_md)
 
     def populations(each: FloatArray, settled: float = _SETTLED) -> FloatArray | None:
         md, rolled = (np.tensordot(each[part], by_unit[part], 1) for part in (slice(n_md), slice(n_md, None)))
-        both = _ended(md) + rolled
-        if averages is not None:
-            both = (averages.shifted(rng) if settled else averages).beside(both, each[:n_md])
-        fitted = _fit(both, settled)
+        fitted = _fit(_ended(md) + rolled, settled)
         if fitted is None:
             return None
         out = np.zeros(n)
