@@ -225,6 +225,8 @@ def load_frames(path: str | Path) -> TrainingFrames:
     found = [(column.shape, column.dtype.str) for column in columns]
     if found != [(shape, dtype) for dtype in ("<i2", "<f4")][: len(found)] or (np.diff(starts, prepend=0) < 0).any():
         raise InputError(f"{path} is damaged: its frames are not those that it says it holds.")
+    if header.quantum_nm != QUANTUM_NM:
+        raise InputError(f"{path} counts in units of {header.quantum_nm:g} nm, not {QUANTUM_NM:g}; make it again.")
     velocities = columns[1] if len(columns) > 1 else None
     return TrainingFrames(header.scene, columns[0], starts, header.lag_ps, header.canonical, header.conditions,
                           header.sources, velocities, header.split)  # fmt: skip
@@ -253,7 +255,9 @@ def collect_frames(
 
     With `velocities`, which excludes `canonical`, frames keep their pose and must carry velocities, natural masses'.
     `held`: trajectories that are held out whole; without any, the end of each is. More than `memory_bytes` of frames
-    are kept in a nameless file in the folder `spool`, mapped, which goes when the process does.
+    are kept in a nameless file in the folder `spool`, mapped, which goes when the process does. `sources` name each
+    file's frames by digests: `sha256` of them as they were laid, which hangs on the first file of all, and
+    `shape_sha256` of their distances from the first atom, which does not.
     """
     if velocities and canonical:
         raise InputError("frames with velocities keep their own pose; they cannot be canonical as well.")
@@ -267,7 +271,7 @@ def collect_frames(
     sources = []
     for path, begin in zip(files, starts[:-1].tolist(), strict=True):
         with open_trajectory(path) as reader:
-            digest, at = hashlib.sha256(), begin
+            digest, shape_digest, at = hashlib.sha256(), hashlib.sha256(), begin
             for frames in reader.iter_blocks(_BLOCK):
                 block = slice(at, at + len(frames))
                 if not np.isfinite(frames).all():
@@ -281,9 +285,12 @@ def collect_frames(
                     posed = frames - frames.mean(axis=1, keepdims=True)
                 coordinates[block] = quantise(posed)
                 digest.update(coordinates[block].tobytes())
+                reach_nm = np.linalg.norm(frames - frames[:, :1].astype(np.float64), axis=-1)
+                shape_digest.update(np.rint(reach_nm / QUANTUM_NM).astype(np.int32).tobytes())
                 at += len(frames)
             sources.append({"file": Path(path).name, "n_frames": reader.n_frames, "seed": reader.record.get("seed"),
-                            "sha256": digest.hexdigest()[:16]})  # fmt: skip
+                            "topology": scene.topology_hash, "sha256": digest.hexdigest()[:16],
+                            "shape_sha256": shape_digest.hexdigest()[:16]})  # fmt: skip
     split = Split(held=tuple(range(len(paths), len(files))))
     return TrainingFrames(scene, coordinates, starts, lag_ps, canonical, conditions, tuple(sources), moving, split)
 
@@ -519,6 +526,10 @@ class References:
                     f"{name} was made at {here_k} K, {first.scene.name} at {first_k} K; this model takes none."
                 )
             other = by_molecule.setdefault(molecule_key(frames.scene), frames)
+            if other is not frames and other.scene.topology_hash == frames.scene.topology_hash:
+                held = "a windows file keeps its own split; leave it out of `validation`"
+                several = "comes in several files, windows among them; make one windows file of all its trajectories"
+                raise InputError(f"{name}: {held}." if frames in sets.unseen else f"{name} {several}.")
             if other is not frames:
                 both = " and would be both trained on and held out" if frames in sets.unseen else ""
                 raise InputError(

@@ -64,6 +64,11 @@ def first_line(error: BaseException) -> str:
     return lines[0].rstrip(".") if lines else type(error).__name__
 
 
+def counted(n: int, what: str) -> str:
+    """Return a number with its noun, `1 atom` or `2 atoms`."""
+    return f"{n} {what}{'' if n == 1 else 's'}"
+
+
 def listed(things: Sequence[str], most: int = 6) -> str:
     """Return names as a message lists them: `A1, A2 and 5 more`."""
     return ", ".join(things[:most]) + (f" and {len(things) - most} more" if len(things) > most else "")

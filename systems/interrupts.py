@@ -147,10 +147,10 @@ def deferred_interrupt() -> Iterator[Callable[[], bool]]:
 _GRACE_S = 10.0
 
 
-def end_with_parent(*, grace_s: float = _GRACE_S) -> None:
+def end_with_parent() -> None:
     """Watch the parent of this worker process from a thread of its own; to be called once, when the worker starts. When
     the parent is gone (killed, even by `kill -9`) this process gets SIGTERM, at which a run stops between two frames
-    with a checkpoint, and after `grace_s` seconds more it exits. In a process without a parent of ours: nothing."""
+    with a checkpoint, and ten seconds later it exits. In a process without a parent of ours: nothing."""
     parent = multiprocessing.parent_process()
     if parent is None:
         return
@@ -159,7 +159,7 @@ def end_with_parent(*, grace_s: float = _GRACE_S) -> None:
         wait([parent.sentinel])
         os.kill(os.getpid(), signal.SIGTERM)
         # A daemon thread: an orderly end of the process comes first.
-        threading.Event().wait(grace_s)
+        threading.Event().wait(_GRACE_S)
         os._exit(1)
 
     threading.Thread(target=watch, name="parent-watch", daemon=True).start()

@@ -149,10 +149,10 @@ def guarded(token: str, witness: Path, work: Callable[[], dict[str, Any]]) -> di
 def result_of(future: Any) -> dict[str, Any]:
     """Return what a task returned; one that Dask itself gave up counts as failed, and may be tried again."""
     if future.status == "cancelled":
-        raise SimulationError("the Dask scheduler is gone; the same command goes on with another.")
+        raise SimulationError("the Dask scheduler is gone; run the same command to continue with another.")
     if future.status == "error":
         error = future.exception()
         killed = type(error).__name__ == "KilledWorker"
-        reason = "its workers were killed again and again" if killed else f"{type(error).__name__}: {error}"
+        reason = "its workers were killed repeatedly" if killed else f"{type(error).__name__}: {error}"
         return {"status": "failed", "reason": reason, "hopeless": False}
     return dict(future.result())

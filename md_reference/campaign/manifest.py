@@ -37,7 +37,6 @@ class SceneEntry:
     formula: str | None = None
     topology_hash: str | None = None
     molecule_key: str | None = None
-    platform: str | None = None
     force: dict[str, Any] = field(default_factory=dict)
     repairs: tuple[str, ...] = ()
     starts: str = ""

@@ -159,8 +159,8 @@ def run_campaign(
                         job.stop()
                         done, n = job.manifest.counts().get(COMPLETE, 0), len(job.manifest.runs)
                         raise KeyboardInterrupt(
-                            f"{done} of {n} runs in {campaign.folder} are complete, begun ones are kept; the same "
-                            "command goes on"
+                            f"{done} of {n} runs in {campaign.folder} are complete, unfinished ones are kept; run "
+                            "the same command to continue"
                         )
                 if progress is not None:
                     progress(job.progress())

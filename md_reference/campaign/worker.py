@@ -107,9 +107,7 @@ def _chosen(kind: type[T], spec: SceneSpec) -> T:
 def load_prepared(path: Path) -> PreparedScene:
     """Read what `prepare_scene` wrote. Raises InputError when it cannot be read."""
     try:
-        record = dict(parsed(content(path)))
-        record.pop("platform", None)  # of an earlier version
-        return built(PreparedScene, record)
+        return built(PreparedScene, parsed(content(path)))
     except (OSError, ValueError, TypeError) as error:
         raise InputError(f"{path} cannot be read ({error}); delete it to have the scene prepared again.") from error
 

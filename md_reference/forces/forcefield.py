@@ -17,6 +17,8 @@ from systems.errors import PreparationError
 from systems.library.named_scenes import check_law
 from systems.scene import IntArray, Scene, once_per_scene, part_of
 
+# Hydrogen of natural mass is the lightest atom that there is.
+_LEAST_MASS_DA = 1.0
 # Energies of the model systems, in kJ/mol; lengths in nm.
 _LAWS = {
     "harmonic": "0.5*(kx*x^2+ky*y^2+kz*z^2)",
@@ -58,8 +60,8 @@ def resolve(scene: Scene, spec: ForceFieldSpec) -> ForceFieldSpec:
     """
     name = spec.force_field
     if (name == MODEL) != (scene.interactions is not None) and name != "auto":
-        brings = "has no" if name == MODEL else "brings its"
-        raise PreparationError(f"scene {scene.name!r} {brings} own law; leave `force_field` out.")
+        defines = "does not define" if name == MODEL else "defines"
+        raise PreparationError(f"scene {scene.name!r} {defines} its own potential; leave `force_field` out.")
     if name == "auto":
         name = MODEL if scene.interactions is not None else _choose(scene)
     solvent = spec.solvent
@@ -107,6 +109,13 @@ def build_system(scene: Scene, spec: ForceFieldSpec, *, rough: bool = False) -> 
         system = _build_mixed(scene, spec, rough=rough)
     if scene.cell_nm is not None:
         system.setDefaultPeriodicBoxVectors(*(row.tolist() for row in scene.cell_nm))
+    masses_da = [system.getParticleMass(k)._value for k in range(scene.n_atoms)]
+    lightest = int(np.argmin(masses_da))
+    if masses_da[lightest] < _LEAST_MASS_DA:
+        raise PreparationError(
+            f"scene {scene.name!r}: hydrogens of {spec.hydrogen_mass_da} Da leave atom {scene.atom_names[lightest]} "
+            f"{masses_da[lightest]:.2f} Da; use a smaller `hydrogen_mass_da`, such as 3Da."
+        )
     return system
 
 

@@ -339,8 +339,8 @@ def announce(scene: Scene) -> None:
     stderr unless a program that uses this package decides else."""
     if (expected := expected_s(scene.n_atoms)) >= _WORTH_SAYING_S:
         about = format_wall(float(f"{expected:.1g}"))
-        what = f"AM1-BCC charges of {scene.n_atoms} atoms, about {about} on an idle core, once: they are kept"
-        _log.warning("%s: %s", scene.name, what)
+        what = f"computing AM1-BCC charges for {scene.n_atoms} atoms (about {about} on an idle core)"
+        _log.warning("%s: %s; the result is cached", scene.name, what)
 
 
 # ---- AMBER parameter files (prmtop) ---------------------------------------------------------------------------------

@@ -47,7 +47,8 @@ def build_quantum_system(
         raise PreparationError(f"gfn2-xtb needs OpenMM's PythonForce, which {openmm.__version__} lacks; update OpenMM.")
     if scene.n_atoms > LARGEST:
         raise PreparationError(
-            f"scene {scene.name!r} has {scene.n_atoms} atoms; gfn2-xtb is offered up to {LARGEST}. Use a force field."
+            f"scene {scene.name!r} has {scene.n_atoms} atoms; gfn2-xtb is limited to {LARGEST} atoms here. "
+            "Use a force field."
         )
     potential = Potential(scene, solvent)
     potential(scene.positions_nm)  # what the method refuses is known before anything runs

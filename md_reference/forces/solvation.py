@@ -105,20 +105,20 @@ def _diameter_nm(scene: Scene) -> float:
 def require_molecules(spec: ForceFieldSpec) -> None:
     """Raise InputError where waters of a file are to be kept in a solvent that is none of molecules."""
     if not spec.is_explicit:
-        raise InputError("`keep_water` needs a solvent of molecules; give `solvent='tip3p'` or opc, or leave it out.")
+        raise InputError("`keep_water` needs an explicit solvent; give `solvent='tip3p'` or opc, or leave it out.")
 
 
 def solvate_if_asked(
     scene: Scene, spec: ForceFieldSpec, *, seed: int = 0, temperature_k: float = 300.0, **box: float | None
 ) -> Scene:
     """Return the scene in water where `spec.solvent` is explicit and it has no cell yet, else as it is. `box`: fields
-    of `WaterBox`, None for their defaults. Raises InputError for one that nothing would use."""
+    of `WaterBox`, None for their defaults. Raises InputError for one that has no effect."""
     given = {name: value for name, value in box.items() if value is not None}
     if spec.is_explicit and scene.cell_nm is None:
         return solvate(scene, spec, WaterBox(**given), seed=seed, temperature_k=temperature_k)
-    named = " and ".join(f"`{name}`" for name in given)
+    named, has = " and ".join(f"`{name}`" for name in given), "have" if len(given) > 1 else "has"
     if given and not spec.is_explicit:
-        raise InputError(f"nothing would use {named} without water around the scene; give `solvent='tip3p'` or opc.")
+        raise InputError(f"{named} {has} no effect without explicit water; give `solvent='tip3p'` or opc.")
     if given:
         raise InputError(f"scene {scene.name!r} has a periodic cell already; leave {named} out.")
     return scene

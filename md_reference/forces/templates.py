@@ -17,7 +17,7 @@ from md_reference.forces.spec import (
     unmatched_residues,
     water_file,
 )
-from systems.errors import InputError, PreparationError, first_line
+from systems.errors import InputError, PreparationError, first_line, listed
 from systems.scene import IntArray, Scene
 
 
@@ -49,7 +49,7 @@ def build_templated(scene: Scene, spec: ForceFieldSpec) -> Any:
             "it lacks"
         )
         if error.is_atom:  # whatever was asked for, lone atoms are the templates'
-            advice = "a lone atom that is none of its ions; give the whole molecule, or use `level='gfn2-xtb'`"
+            advice = "a single atom that is not one of its ions; give the whole molecule, or use `level='gfn2-xtb'`"
         raise PreparationError(
             f"{spec.force_field} has no parameters for {error.residue} of scene {scene.name!r}, {advice}."
         ) from error
@@ -86,6 +86,8 @@ def _build(scene: Scene, spec: ForceFieldSpec) -> Any:
     if spec.solvent == "amber99-obc":
         wanted.append("amber99_obc.xml")
     force_field = force_field_of(tuple(wanted))
+    ions = _ion_templates(scene, force_field, spec.force_field)
+    templates |= {r: ions[r.index] for r in topology.residues() if r.index in ions}
     settings: dict[str, Any] = {"nonbondedMethod": app.NoCutoff}
     if spec.is_explicit:
         far_nm, near_nm = cutoff_nm(spec.force_field)
@@ -94,19 +96,22 @@ def _build(scene: Scene, spec: ForceFieldSpec) -> Any:
         if near_nm is not None:
             settings["switchDistance"] = near_nm * unit.nanometer
     real = list(range(scene.n_atoms))
-    # CHARMM's terminal residues are patches, which only createSystem tries.
-    if spec.solvent != "opc" and not is_charmm:
-        for residue in force_field.getUnmatchedResidues(topology):
-            raise Unmatched(scene, residue.index)
     try:
+        # CHARMM's terminal residues are patches, which only createSystem tries.
+        if spec.solvent != "opc" and not is_charmm:
+            for residue in force_field.getUnmatchedResidues(topology, templates):
+                raise Unmatched(scene, residue.index)
         if spec.solvent == "opc":  # whose waters have a virtual site
             modeller = app.Modeller(topology, scene.positions_nm * unit.nanometer)
-            modeller.addExtraParticles(force_field)
+            modeller.addExtraParticles(force_field, residueTemplates=templates)
             topology = modeller.topology
+            templates = {r: ions[r.index] for r in topology.residues() if r.index in ions}
             real = [a.index for a in topology.atoms() if a.element is not None]
         system = force_field.createSystem(
             topology, residueTemplates=templates, rigidWater=True, **settings, **spec.openmm_settings()
         )
+    except Unmatched:
+        raise
     except Exception as error:  # OpenMM raises KeyError, ValueError and bare Exception here
         if absent := re.match(r"No template found for residue (\d+)", str(error)):
             raise Unmatched(scene, int(absent[1])) from error
@@ -123,6 +128,35 @@ def _build(scene: Scene, spec: ForceFieldSpec) -> Any:
         order[[*real, *virtual]] = np.arange(len(order))
         system = permuted(system, order)
     return system
+
+
+def _ion_templates(scene: Scene, force_field: Any, name: str) -> dict[int, str]:
+    """The templates of lone atoms, by residue, where the force field has several of their element: by charge (Fe2+,
+    Fe3+), then by the residue's name, else those that go with the water, which come last. Raises PreparationError where
+    the force field `name` has the element's ions in other charges alone."""
+    from openmm.app.forcefield import NonbondedGenerator
+
+    (nonbonded,) = (g for g in force_field.getGenerators() if isinstance(g, NonbondedGenerator))
+    known: dict[str, dict[str, int]] = {}
+    for key, template in force_field._templates.items():
+        if len(template.atoms) == 1 and (atom := template.atoms[0]).element is not None:
+            parameters = {**nonbonded.params.paramsForType.get(atom.type, {}), **atom.parameters}
+            known.setdefault(atom.element.symbol, {})[key] = round(parameters["charge"])
+    found = {}
+    for residue in np.flatnonzero(np.bincount(scene.residue_of_atom) == 1).tolist():
+        i = int(np.flatnonzero(scene.residue_of_atom == residue)[0])
+        ions, charge = known.get(scene.elements[i], {}), int(scene.formal_charges[i])
+        fitting = [key for key, q in ions.items() if q == charge]
+        if ions and not fitting:
+            others = listed([f"{q:+d}" for q in ions.values()])
+            raise PreparationError(
+                f"{name} has no {scene.elements[i]} ion of charge {charge:+d}, only {others} "
+                f"({_describe(scene, residue)} of scene {scene.name!r}); leave it out, or use `level='gfn2-xtb'`."
+            )
+        if len(ions) > 1:
+            own = scene.residue_names[residue]
+            found[residue] = own if own in fitting else fitting[-1]
+    return found
 
 
 def _with_water_named(scene: Scene) -> Scene:

@@ -108,8 +108,8 @@ def check_same_run(old: dict[str, Any], config: MDConfig, out: Path, *, ignoring
 
 def resolved(scene: Scene, config: MDConfig) -> MDConfig:
     """Return the settings with force field, solvent and ensemble resolved for this scene (solvated, where the solvent
-    is explicit): the one value that every later stage of a run takes. Raises UnknownNameError, InputError for a
-    constant pressure without a periodic cell, and what `forcefield.resolve` raises."""
+    is explicit): the one value that every later stage of a run takes. Raises UnknownNameError, InputError for an
+    ensemble that the scene or the platform cannot have, and what `forcefield.resolve` raises."""
     from md_reference.forces.forcefield import resolve  # the builders of forces are slow to import
 
     config = replace(config, ensemble=config.ensemble.lower())
@@ -122,7 +122,16 @@ def resolved(scene: Scene, config: MDConfig) -> MDConfig:
             f"ensemble npt needs a volume, and scene {scene.name!r} has no periodic cell; use nvt, or give an explicit "
             "`solvent`."
         )
-    return replace(config, force=resolve(scene, config.force))
+    if config.platform == SIMD and (config.ensemble != "nvt" or config.columns):
+        raise InputError("platform simd supports only nvt and saves only positions; use another platform.")
+    config = replace(config, force=resolve(scene, config.force))
+    if config.ensemble == "nve" and config.force.solvent == "opc":
+        # OpenMM's CustomIntegrator places virtual sites at the end of a step, after the forces were needed.
+        raise InputError(
+            "nve is not available with OPC: velocity Verlet does not move its virtual sites in time; use "
+            "`solvent='tip3p'`, or nvt."
+        )
+    return config
 
 
 def check_run(scene: Scene, config: MDConfig, out: Path) -> MDConfig:
@@ -211,7 +220,7 @@ def _of_quantum(scene: Scene | str, asked: Mapping[str, Any]) -> dict[str, Any]:
     longest_ps = _longest_step_ps(scene)
     step_ps = asked.get("timestep_ps", _FLEXIBLE_QUANTUM_STEP_PS if is_flexible else longest_ps)
     if step_ps > longest_ps:
-        stiff = "so stiff a bond (triple, aldehyde, imine, =CH2, CH=CH, C=O in a small ring)"
+        stiff = "a bond this stiff (triple, aldehyde, imine, =CH2, CH=CH, C=O in a small ring)"
         what = stiff if longest_ps < LONGEST_QUANTUM_STEP_PS else QUANTUM
         use = format_time_ps(longest_ps).replace(" ", "")
         raise InputError(f"{format_time_ps(step_ps)} is too long for {what}; use `timestep_ps='{use}'` or less.")
@@ -228,7 +237,7 @@ def _decisive(name: str, protocol: str | None) -> tuple[dict[str, Any], tuple[st
     if protocol is None:
         return own, ("by the system's own settings", named_scenes.entry(name).source if own else "")
     if own:
-        raise InputError(f"{name} brings its own law and its own settings; leave `protocol` out.")
+        raise InputError(f"{name} defines its own potential and settings; leave `protocol` out.")
     found = named_scenes.find_protocol(protocol)
     return dict(found.settings), (f"by protocol {found.name}", found.source)
 

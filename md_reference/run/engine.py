@@ -76,13 +76,13 @@ def refuse_damaged(scene: Scene, minimised_nm: FloatArray) -> None:
         label = [f"{scene.residue_names[r]} {scene.residue_ids[r]} {a}" for a, r in zip(scene.atom_names, residue)]
         names = [" - ".join(label[i] for i in bonds[k]) for k in broken]
         raise PreparationError(
-            f"{scene.name}: minimising its energy breaks the bond {listed(names, 3)} ({10 * now[broken[0]]:.2f} Å), as "
-            "atoms stand in each other there; correct the coordinates, or build the molecule anew."
+            f"{scene.name}: energy minimisation breaks the bond {listed(names, 3)} ({10 * now[broken[0]]:.2f} Å) "
+            "because atoms overlap there; correct the coordinates or rebuild the molecule."
         )
     if what := changed_stereo(part_of(scene, atoms), minimised_nm[atoms][None])[0]:
         raise PreparationError(
-            f"{scene.name}: when its energy is minimised {what}, as the geometry is broken there; correct the "
-            "coordinates, or build the molecule anew."
+            f"{scene.name}: in energy minimisation {what} because the geometry is broken there; correct the "
+            "coordinates or rebuild the molecule."
         )
 
 

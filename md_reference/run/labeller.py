@@ -6,6 +6,8 @@ from __future__ import annotations
 import multiprocessing
 import signal
 from collections.abc import Sequence
+from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -20,6 +22,7 @@ from md_reference.forces.spec import QUANTUM, ForceFieldSpec
 from md_reference.run.config import Conditions
 from md_reference.run.engine import Engine
 from md_reference.run.machine import available_cores
+from md_reference.run.replicas import refuse_within_import, signals_held
 from systems.chemistry.distance_bonds import changed_bond
 from systems.chemistry.graph import turn_torsions
 from systems.chemistry.validity import changed_stereo
@@ -70,21 +73,24 @@ class Labeller(Closing):
     whose minimum is another one."""
 
     def __init__(self, scene: Scene, *, workers: int | None = None) -> None:
+        self.n_workers = workers or available_cores()
+        if self.n_workers > 1:
+            refuse_within_import()
         self.scene = scene
         self._potential = Potential(scene)
         check_minimum(scene)  # what the method refuses is known before anything runs
         self.n_rearranged = 0
-        self.n_workers = workers or available_cores()
-        self._pool: Any = None
+        self._pool: ProcessPoolExecutor | None = None
         if self.n_workers > 1:
             context = multiprocessing.get_context("spawn")
-            self._pool = context.Pool(self.n_workers, _start, (scene.to_dict(),))
+            self._pool = ProcessPoolExecutor(self.n_workers, context, _start, (scene.to_dict(),))
+            with signals_held():
+                self._pool.submit(int)  # starts the processes
 
     def close(self) -> None:
         """End the processes."""
         if self._pool is not None:
-            self._pool.terminate()
-            self._pool.join()
+            self._pool.shutdown(cancel_futures=True)
             self._pool = None
 
     def label(self, positions_nm: FloatArray) -> Labels:
@@ -118,7 +124,13 @@ class Labeller(Closing):
     def _answers(self, states: FloatArray) -> list[tuple[float, FloatArray] | None]:
         if self._pool is None:
             return [_answer(state, self._potential) for state in states]
-        return list(self._pool.map(_answer, states, chunksize=4))
+        try:
+            return list(self._pool.map(_answer, states, chunksize=4))
+        except BrokenProcessPool as error:
+            raise SimulationError(
+                "a labelling process ended unexpectedly (killed, out of memory, or started by a script without "
+                "`if __name__ == '__main__':`)."
+            ) from error
 
     def explore(self, n_states: int, temperatures_k: Sequence[float], *, seed: int) -> FloatArray:
         """Return states `(n, n_atoms, 3)` nm of hot MD by GAFF2 (`rough`, see `gaff.entry`), or by GFN2-xTB where GAFF2

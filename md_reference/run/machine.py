@@ -10,6 +10,8 @@ from functools import cache
 from pathlib import Path
 from typing import Annotated, Any
 
+import numpy as np
+
 from md_reference.forces.spec import QUANTUM
 from md_reference.run.config import SIMD, Conditions
 from md_reference.simd.force_field import n_replicas
@@ -86,24 +88,30 @@ def platform_for(scene: Scene, conditions: Conditions, *, max_threads: int = 1) 
     scene's size, so that the same run takes the same one everywhere. `max_threads`: cores for this replica.
 
     Raises UnknownNameError (with the nearest name) for a platform that is not here, InputError for simd, in which
-    OpenMM does not run.
+    OpenMM does not run, and for Reference in a cell that is not rectangular.
     """
     n_atoms, requested, born = scene.n_atoms, conditions.platform, conditions.force.solvent != "vacuum"
     available = [*platforms(), SIMD]
     if requested == SIMD:
-        raise InputError("platform simd is for replicas of `reference` and `run`; take another platform here.")
+        raise InputError("platform simd is for replicas of `reference` and `run`; use another platform here.")
     if requested not in ("auto", *available):
         raise UnknownNameError(
             f"platform {requested!r} is not available here; there are: {', '.join(available)}."
             + nearest(requested, available)
+        )
+    # OpenMM 8.6's Reference platform leaves out pairs there (see `SimdReplicas.check`).
+    is_slanted = scene.cell_nm is not None and np.count_nonzero(scene.cell_nm) > 3
+    if requested == "Reference" and is_slanted:
+        raise InputError(
+            "OpenMM's Reference platform omits pairs in non-rectangular cells, as this scene's; use platform CPU."
         )
     largest = REFERENCE_MAX_ATOMS_BORN if born else REFERENCE_MAX_ATOMS_VACUUM
     device = next((name for name in _DEVICES if name in available and n_atoms > GPU_MIN_ATOMS), None)
     if requested != "auto":
         name, reason = requested, "asked for"
     elif conditions.force.force_field == QUANTUM:
-        name, reason = "Reference", "the quantum program takes all the time of a step"
-    elif n_atoms <= largest:
+        name, reason = "Reference", "the xTB calculation dominates the cost of a step"
+    elif n_atoms <= largest and not is_slanted:
         name, reason = "Reference", f"{n_atoms} atoms: no neighbour lists and no threads to wait for"
     elif device is not None:
         name, reason = device, f"{n_atoms} atoms and a {device} device"

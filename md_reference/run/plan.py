@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from md_reference.forces.forcefield import build_system
-from md_reference.forces.mixture import molecules_of
+from md_reference.forces.mixture import is_water, molecules_of
 from md_reference.forces.nonstandard import find_chain
 from md_reference.forces.spec import MODEL, QUANTUM, ForceFieldSpec
 from md_reference.run.config import SIMD, MDConfig, resolved
@@ -23,6 +23,7 @@ from systems.errors import SimulationError
 from systems.scene import Scene, part_of
 from systems.units import format_wall
 
+_ALL_PAIRS = "all pairs computed (not periodic: no cut-off, PME or barostat)"
 # Above this step a hydrogen of natural mass is integrated badly even with its bond constrained.
 _LONGEST_NATURAL_STEP_PS = 0.0025
 # A short step stands the starting positions, and takes as long as any.
@@ -86,7 +87,7 @@ def make_plan(scene: Scene, config: MDConfig, *, replicas: int = 1, timed: bool 
         "threads": choice.threads,
         "parallel": parallel,
         "hydrogen_mass": "natural" if heavy is None else f"{heavy:g} Da, taken from the atom it is bonded to",
-        "constraints": f"{n_constraints} bonds to hydrogen" if n_constraints else "none",
+        "constraints": _constraints(n_constraints, rigid_waters(scene, spec)),
     }
     return Plan(
         line=plan_line(scene, config, choice, step_s=planned, replicas=replicas),
@@ -95,7 +96,7 @@ def make_plan(scene: Scene, config: MDConfig, *, replicas: int = 1, timed: bool 
         ns_per_day=None if planned is None else _ns_per_day(config, planned),
         wall_s=_wall_s(config, replicas, planned),
         skipped=_skipped(scene, config, n_constraints, planned, default),
-        warnings=(*spec.warnings, *_warnings(scene, spec, config.timestep_ps)),
+        warnings=warnings_of(scene, config),
     )
 
 
@@ -181,19 +182,36 @@ def plan_line(
     threads = "1 thread" if choice.threads == 1 else f"{choice.threads} threads"
     law = spec.force_field if scene.interactions is None else str(scene.interactions.get("kind"))
     born = " (native GBSAOBCForce)" if spec.solvent == "obc2" else ""
-    rigid = spec.constrain_hydrogens and "H" in scene.elements
+    rigid = "no constraints"
+    if spec.constrain_hydrogens and "H" in scene.elements:
+        rigid = "bonds to hydrogen rigid"
+    elif rigid_waters(scene, spec):
+        rigid = "only water rigid"
     parts = [
         f"{scene.n_atoms} atoms, {law} in {spec.solvent}{born}",
         f"{choice.name} on {threads} ({choice.reason})",
         _integrator(config),
-        "bonds to hydrogen rigid" if rigid else "no constraints",
-        "PME in a cell" if scene.cell_nm is not None else "all pairs; no cut-off, cell, PME or barostat without a cell",
+        rigid,
+        "PME in a cell" if scene.cell_nm is not None else _ALL_PAIRS,
     ]
     if step_s is not None:
         parts.append(f"about {_ns_per_day(config, step_s):.3g} ns/day")
     if wall_s is not None:
         parts.append(f"about {format_wall(wall_s)}")
     return "; ".join(parts)
+
+
+def rigid_waters(scene: Scene, spec: ForceFieldSpec) -> int:
+    """Return the number of waters, which are rigid under every classical force field."""
+    if spec.force_field in (QUANTUM, MODEL):
+        return 0
+    return sum(is_water(scene.elements, m) for m in molecules_of(scene))
+
+
+def _constraints(n: int, n_waters: int) -> str:
+    """Return n constraints in words; three of them hold a water."""
+    bonds = [f"{n - 3 * n_waters} bonds to hydrogen"] if n > 3 * n_waters else []
+    return ", ".join(bonds + [f"{n_waters} rigid waters"] * bool(n_waters)) or "none"
 
 
 def _skipped(
@@ -205,13 +223,13 @@ def _skipped(
         skipped["periodic box, PME, neighbour lists"] = "the scene has no periodic cell; all pairs are computed exactly"
     if ensemble != "npt":
         skipped["barostat"] = f"the ensemble is {ensemble}"
-    rest = "the Langevin bath acts on it like on everything else"
+    rest = "not needed: the Langevin thermostat also acts on the centre of mass"
     if ensemble == "nve":
         skipped["thermostat"] = "the ensemble is nve"
-        rest = "it is put at rest once and stays there"
+        rest = "set to zero once; NVE conserves it"
     skipped["removal of centre-of-mass motion"] = rest
     if not config.save_velocities:
-        skipped["velocities on disk"] = "nobody asked for them (`save_velocities=True`): half of the file"
+        skipped["velocities on disk"] = "not requested (`save_velocities=True`); halves the file size"
     kept = config.kept_atoms(scene)
     if kept is not None:
         share = f"{1 - len(kept) / scene.n_atoms:.0%} of the file"
@@ -228,8 +246,10 @@ def _skipped(
     return skipped
 
 
-def _warnings(scene: Scene, spec: ForceFieldSpec, timestep_ps: float) -> tuple[str, ...]:
-    found = []
+def warnings_of(scene: Scene, config: MDConfig) -> tuple[str, ...]:
+    """Return what is known to go badly with these settings, one line each. `config`: `resolved`."""
+    spec, timestep_ps = config.force, config.timestep_ps
+    found = [*spec.warnings]
     if spec.force_field.endswith("+gaff2"):
         chains = [find_chain(part_of(scene, m)) for m in molecules_of(scene)]
         lacking = [name for chain in chains if chain is not None for name in chain.lacking]
@@ -241,8 +261,9 @@ def _warnings(scene: Scene, spec: ForceFieldSpec, timestep_ps: float) -> tuple[s
     natural = spec.hydrogen_mass_da is None or spec.hydrogen_mass_da < 1.5
     if timestep_ps > _LONGEST_NATURAL_STEP_PS and natural and "H" in scene.elements:
         found.append(
-            f"{timestep_ps * 1000:g} fs is long for hydrogens of natural mass; use `hydrogen_mass_da='3Da'` or 2fs."
+            f"{timestep_ps * 1000:g} fs is too long for hydrogens of natural mass; use `hydrogen_mass_da='3Da'` or "
+            "`timestep_ps='2fs'`."
         )
     if timestep_ps > 0.001 and not spec.constrain_hydrogens and "H" in scene.elements:
-        found.append(f"{timestep_ps * 1000:g} fs is long for unconstrained bonds to hydrogen; use at most 1fs.")
+        found.append(f"{timestep_ps * 1000:g} fs is too long for flexible bonds to hydrogen; use `timestep_ps='1fs'`.")
     return tuple(found)

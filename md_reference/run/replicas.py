@@ -6,10 +6,12 @@ from __future__ import annotations
 import math
 import multiprocessing
 import os
+import signal
 import time
-from collections.abc import Callable, Sequence
-from contextlib import ExitStack, suppress
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import replace
+from multiprocessing import resource_tracker
 from pathlib import Path
 from typing import Any, cast
 
@@ -23,7 +25,8 @@ from md_reference.run.machine import available_cores, platform_for, simd_choice
 from md_reference.run.plan import plan_line
 from md_reference.run.simulate import ProgressFn, StoredRun, already_complete, record_of, report_preparing, simulate
 from md_reference.run.starts import many_starts
-from md_reference.simd.force_field import SimdReplicas, n_replicas
+from md_reference.simd.force_field import CENTRED_STEPS, SimdReplicas, n_replicas
+from md_reference.simd.system_terms import read_terms
 from systems.errors import InputError, SimulationError, SurromdError
 from systems.interrupts import deferred_interrupt, end_with_parent
 from systems.scene import FloatArray, Scene
@@ -51,8 +54,6 @@ def simulate_batch(
     `completed: false`), and what `simulate` raises.
     """
     config = check_run(scene, config, outs[0])
-    if config.ensemble != "nvt" or config.columns:
-        raise InputError("platform simd runs in a bath (nvt) and keeps positions alone; take another platform.")
     if len(outs) > n_replicas():
         raise InputError(f"{len(outs)} replicas are more than the {n_replicas()} of a batch.")
     state_path = checkpoint_path(outs[0])
@@ -68,7 +69,8 @@ def simulate_batch(
         with ExitStack() as stack:
             writers = []
             for k, out in enumerate(outs):
-                own = {**record, "replica": k, "of_replicas": len(outs), **(notes[k] if notes else {})}
+                own = {**record, "replica": k, "of_replicas": len(outs), "batch": [k, len(outs)]}
+                own |= notes[k] if notes else {}
                 writer = writer_at(out, batch.written, own, batch.header, k, resumed=batch.resumed)
                 writers.append(stack.enter_context(writer))
             batch.produce(writers)
@@ -109,16 +111,21 @@ class _Batch(StoredRun):
                 raise KeyboardInterrupt
             self.simd.step(min(piece, n_steps - done))
             report_preparing(self.progress, min(1.0, (done + piece) / n_steps))
+        self.blob = self.simd.checkpoint()
         self.save()
 
     def save(self) -> None:
-        self.keep(self.simd.checkpoint(), platform=SIMD)
+        self.keep(self.blob, platform=SIMD)
 
     def frame(self) -> tuple[npt.NDArray[np.float32], FloatArray, FloatArray] | None:
         """Return positions, energies and temperatures of all replicas."""
-        if self.asked_to_stop():
-            return None
-        self.simd.step(self.config.steps_per_frame)
+        per_frame = self.config.steps_per_frame
+        # As many at once as `SimdReplicas.step` would take of a frame's.
+        for done in range(0, per_frame, CENTRED_STEPS):
+            if self.asked_to_stop():
+                return None
+            self.simd.step(min(CENTRED_STEPS, per_frame - done))
+        self.blob = self.simd.checkpoint()
         positions = self.simd.positions_nm[:, self.atoms].astype(np.float32)
         return positions, self.simd.energies(), self.simd.temperatures_k()
 
@@ -134,8 +141,30 @@ class _Batch(StoredRun):
 # ---- processes ------------------------------------------------------------------------------------------------------
 
 
-# The exit status of a process that would start replicas while it imports the script which has started it.
+# The exit status of a process that would start others while it imports the script which has started it.
 _UNGUARDED = 79
+_HELD = {signal.Signals[name] for name in {"SIGINT", "SIGHUP"} & set(signal.Signals.__members__)}
+
+
+def refuse_within_import() -> None:
+    """End this process if it is one that a script has started and that has not come further than that script."""
+    if getattr(multiprocessing.current_process(), "_inheriting", False):
+        raise SystemExit(_UNGUARDED)
+
+
+@contextmanager
+def signals_held() -> Iterator[None]:
+    """Have Ctrl-C and a hang-up wait, here until the block ends, in processes that it starts until they unblock them:
+    what is still importing would print a traceback. Nothing where there are no signal masks (Windows)."""
+    if not hasattr(signal, "pthread_sigmask"):
+        yield
+        return
+    resource_tracker.ensure_running()  # which unblocks signals when it starts, in Python 3.11
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, _HELD)
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def simulate_replicas(
@@ -159,8 +188,7 @@ def simulate_replicas(
     starts them outside `if __name__ == '__main__':`, SimulationError with the first replica's reason when the others
     have ended.
     """
-    if getattr(multiprocessing.current_process(), "_inheriting", False):
-        raise SystemExit(_UNGUARDED)  # this is one of the processes, which has not come further than the user's script
+    refuse_within_import()
     given = None if isinstance(scene, Scene) else list(scene)
     scene = scene if isinstance(scene, Scene) else scene[0]
     for out in outs:
@@ -177,17 +205,21 @@ def simulate_replicas(
             choice = platform_for(scene, config, max_threads=each)
         if announce is not None:
             announce(plan_line(scene, config, choice or simd_choice(), replicas=len(outs)))
-    scenes = [scene] * len(outs) if given is None else given
+    scenes, found = [scene] * len(outs) if given is None else given, ""
     if fresh and given is None and config.starts == "many" and len(outs) > 1:
         report_preparing(progress, 0.0)
+        if config.platform == SIMD:  # what it cannot compute is refused before any MD
+            read_terms(build_system(scene, config.force), (), size)
         starts, found = many_starts(scene, config, len(outs))
         scenes = list(starts)
         if announce is not None:
             announce(found)
-    how: dict[str, Any] = {"resume": resume, "overwrite": overwrite, "choice": choice}
 
     def job(k: int) -> tuple[list[Scene], MDConfig, list[Path], dict[str, Any]]:
         own = replace(config, seed=config.seed + jobs[k][0])
+        begun = {"starting_structures": found} if found else {}
+        notes = [{"replica": i, "of_replicas": len(outs), **begun} for i in jobs[k]]
+        how = {"resume": resume, "overwrite": overwrite, "choice": choice, "notes": notes}
         return [scenes[i] for i in jobs[k]], own, [outs[i] for i in jobs[k]], how
 
     if len(jobs) == 1:
@@ -213,7 +245,8 @@ def simulate_replicas(
                     k = waiting.pop(0)
                     pipe, end = context.Pipe(duplex=False)
                     process = context.Process(target=_replicas, args=(*job(k), end), name=f"replica-{jobs[k][0]}")
-                    process.start()
+                    with signals_held():
+                        process.start()
                     end.close()
                     running[k] = process, pipe
                 time.sleep(0.1)
@@ -258,8 +291,8 @@ def _run(
     """Run one replica, or on platform simd a batch of them; `how`: what else `simulate` takes."""
     if config.platform == SIMD:
         starts = None if all(s is scenes[0] for s in scenes[1:]) else np.stack([s.positions_nm for s in scenes])
-        of_files = {"resume": how["resume"], "overwrite": how["overwrite"], "progress": progress}
-        simulate_batch(scenes[0], config, outs, starts_nm=starts, **of_files)
+        of_files = {key: value for key, value in how.items() if key != "choice"}
+        simulate_batch(scenes[0], config, outs, starts_nm=starts, progress=progress, **of_files)
     else:
         simulate(scenes[0], config, outs[0], progress=progress, **how)
 
@@ -274,6 +307,8 @@ def _replicas(scenes: Sequence[Scene], config: MDConfig, outs: Sequence[Path], h
             pipe.send(("done", done) if note is None else ("equilibrated", done / total))
 
     try:
+        if hasattr(signal, "pthread_sigmask"):
+            signal.pthread_sigmask(signal.SIG_UNBLOCK, _HELD)  # see `signals_held`
         _run(scenes, config, outs, how, report)
     except SurromdError as error:
         pipe.send(("failed", str(error)))

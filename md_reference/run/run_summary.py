@@ -110,12 +110,13 @@ def summary_lines(summary: dict[str, Any]) -> list[str]:
         # Where neither chance nor a usual time step explains it.
         off = float(temperature["mean"] - target)
         if abs(off) > _STANDARD_ERRORS * error + _BIAS * target:
-            lines.append(f"warning: the mean temperature is {off:+.1f} K off the bath's; try a shorter `timestep_ps`.")
+            by = f"differs from the thermostat's by {off:+.1f} K"
+            lines.append(f"warning: the mean temperature {by}; try a shorter `timestep_ps`.")
     if changed := summary.get("changed"):
         lines.append(
             f"warning: {changed['n_frames']} of {summary['n_frames']} frames, the first after "
-            f"{format_time_ps(changed['first_ps'])}, are not the molecule that was given "
-            f"({', '.join(changed['what'])}); they are marked. It does not keep its form at this level."
+            f"{format_time_ps(changed['first_ps'])}, are no longer the input molecule "
+            f"({', '.join(changed['what'])}) and are flagged; it is not stable at this level of theory."
         )
     return lines
 

@@ -69,16 +69,19 @@ def simulate(
     overwrite: bool = False,
     progress: ProgressFn | None = None,
     choice: PlatformChoice | None = None,
+    notes: Sequence[dict[str, Any]] = (),
 ) -> Path:
     """Run reference MD and stream it to `out` (.h5, .dcd, .xtc): frames at save_every_ps, 2 save_every_ps ... time_ps.
 
     A checkpoint stands behind every block of frames: a `kill -9`, a full disk or a power failure loses at most one save
     interval, half a second of work, or fifty times what it takes to write, whichever is the longest. `resume=True` goes
-    on from there with the same random stream, on the same platform. Ctrl-C and SIGTERM stop at once, with a checkpoint
+    on from there with the same random stream, on the same platform, bit for bit but in npt: OpenMM's checkpoint has not
+    the barostat's counter, step size and random numbers. Ctrl-C and SIGTERM stop at once, with a checkpoint
     at the last frame: KeyboardInterrupt. No other process can write `out` meanwhile.
 
-    `choice`: the platform where it has been chosen before. Raises SimulationError when coordinates stop being finite or
-    the system blows up: the frames before stay in the file, which then says `completed: false`.
+    `choice`: the platform where it has been chosen before. `notes`: one entry, added to the record. Raises
+    SimulationError when coordinates stop being finite or the system blows up: the frames before stay in the file, which
+    then says `completed: false`.
     """
     out = Path(out)
     config = check_run(scene, config, out)
@@ -91,7 +94,7 @@ def simulate(
         run = _Run(scene, config, [out], kept, overwrite=overwrite, asked_to_stop=asked_to_stop, progress=progress)
         run.start(choice)
         how: dict[str, Any] = {"resumed": run.resumed, "columns": config.columns}
-        record = record_of(scene, config, run.choice)
+        record = record_of(scene, config, run.choice) | (notes[0] if notes else {})
         with run.engine, writer_at(out, run.written, record, run.header, **how) as writer:
             run.produce([writer])
         chk.unlink(missing_ok=True)
@@ -135,12 +138,9 @@ class StoredRun:
         try:
             self.stand = built(Stand, {k: v for k, v in self.header.items() if k in Stand.__annotations__})
         except ValueError as error:
-            raise InputError(f"checkpoint {checkpoint_path(outs[0])} cannot be gone on from ({error}).") from error
+            raise InputError(f"checkpoint {checkpoint_path(outs[0])} cannot be resumed ({error}).") from error
         if self.resumed:
             check_same_run(self.stand.config, config, outs[0])
-            if self.header.get("steps_into_frame") or self.header.get("equilibrated_steps") is not None:
-                chk = checkpoint_path(outs[0])
-                raise InputError(f"{chk} is between two frames, of an earlier version; start with `overwrite`.")
         self.began = time.monotonic()
         self.done = int(self.header["files"][0]["n_frames"])
         solute = config.kept_atoms(scene)

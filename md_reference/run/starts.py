@@ -52,15 +52,17 @@ def many_starts(scene: Scene, conditions: Conditions, n: int, *, hot_ps: float =
     """
 
     def one(why: str) -> Starts:
-        return (scene,) * n, f"all from one structure: {why}"
+        return (scene,) * n, f"all replicas start from the input structure: {why}"
 
     if n == 1 or scene.interactions is not None:
         return one("one replica" if n == 1 else "a model system")
     solute = solute_of(scene) if scene.cell_nm is not None else np.arange(scene.n_atoms)
+    if not len(solute):
+        return one("nothing but water and ions")
     dry = scene if len(solute) == scene.n_atoms and scene.cell_nm is None else part_of(scene, solute)
     conformers = ring_conformers(dry)
     if len(conformers) == 1 and not len(rotatable_torsions(dry)):
-        return one("no torsion turns")
+        return one("it has no rotatable torsions")
     if scene.cell_nm is not None:
         dry = replace(dry, cell_nm=None)
     try:
@@ -72,10 +74,10 @@ def many_starts(scene: Scene, conditions: Conditions, n: int, *, hot_ps: float =
             frames = _in_water(scene, conditions, dry, angles, turned_ps)
     except (PreparationError, SimulationError) as error:
         return one(str(error).rstrip("."))
-    how = f"{n} starts: the structure given and, {by}, states after {hot_ps:.3g} ps at {HOT_K:g} K"
+    how = f"{n} starting structures: the input, and others from {hot_ps:.3g} ps at {HOT_K:g} K ({by})"
     if len(conformers) > 1:
         how += f" of {len(conformers)} ring conformers"
-    return _scenes(scene, frames), how + (", cooled" if scene.cell_nm is None else ", turned to in water")
+    return _scenes(scene, frames), how + (", cooled" if scene.cell_nm is None else ", their torsions set in water")
 
 
 def frames_as_starts(
@@ -102,7 +104,8 @@ def frames_as_starts(
     if not found:
         raise SimulationError(f"none of {tried} frames of the rollout can be a start of MD")
     scenes = _scenes(scene, np.stack(found))
-    return tuple(scenes[k % len(scenes)] for k in range(n)), f"{len(found)} starts: frames of the rollout, relaxed"
+    how = f"starting structure{'s' * (len(found) > 1)}: frames of the rollout, relaxed"
+    return tuple(scenes[k % len(scenes)] for k in range(n)), f"{len(found)} {how}"
 
 
 def _scenes(scene: Scene, frames_nm: FloatArray) -> tuple[Scene, ...]:
@@ -132,10 +135,10 @@ def _hot(
             bases.append(engine.positions())
     geometry = geometry_from_scene(dry)
     try:
-        batches, by = _by_simd(system, conditions, bases, hot_ps), "by SIMD replicas"
+        batches, by = _by_simd(system, conditions, bases, hot_ps), "SIMD replicas"
         batch = next(batches)
     except SimdUnavailableError:
-        batches, by = _by_openmm(dry, system, on_cpu, bases, hot_ps), "by OpenMM"
+        batches, by = _by_openmm(dry, system, on_cpu, bases, hot_ps), "OpenMM"
         batch = next(batches)
     found = [bases[0]]
     for _ in range(2 + 4 * n // len(batch)):
@@ -187,7 +190,7 @@ def _in_water(wet: Scene, conditions: Conditions, dry: Scene, angles: FloatArray
     solute = solute_of(wet)
     quads: IntArray = np.asarray(solute)[rotatable_torsions(dry)]
     system = build_system(wet, conditions.force)
-    with Engine(wet, replace(conditions, platform="CPU"), threads=1, system=system) as engine:
+    with Engine(wet, replace(conditions, platform="CPU", ensemble="nvt"), threads=1, system=system) as engine:
         engine.minimise()
         start = engine.positions()
     out = np.empty((len(angles), wet.n_atoms, 3))

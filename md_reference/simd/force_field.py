@@ -30,7 +30,7 @@ _SOURCE = Path(__file__).with_name("force_field.cpp")
 _FORCE_TOLERANCE, _WET_FORCE_TOLERANCE = 2e-4, 2e-3
 _ENERGY_TOLERANCE_KJ_MOL, _WET_ENERGY_TOLERANCE_KJ_MOL = 0.02, 2e-4
 _CHECKED_AT = 0.002
-_CENTRED_STEPS = 500
+CENTRED_STEPS = 500
 # Waters are listed out to the cutoff and this, for so many steps.
 _LIST_MARGIN_NM = 0.1
 _LIST_STEPS = 20
@@ -105,7 +105,7 @@ def _program(width: int | None = None) -> ctypes.CDLL:
     try:
         program = compiled_program(_SOURCE, {} if width is None else {"W": width})
     except CompilerError as error:
-        raise SimdUnavailableError(f"{error}, which platform simd needs; take another platform.") from error
+        raise SimdUnavailableError(f"{error}, which platform simd needs; use another platform.") from error
     program.work_floats.restype, program.work_floats.argtypes = ctypes.c_int64, [ctypes.c_int64]
     program.size_of_system.restype = ctypes.c_int64
     program.forces.restype, program.forces.argtypes = None, [_POINTER] * 4
@@ -283,7 +283,7 @@ class SimdReplicas:
             if not (off < (_WET_FORCE_TOLERANCE if is_wet else _FORCE_TOLERANCE) and wrong < most):
                 raise SimulationError(
                     f"platform simd differs from OpenMM by {off:.2g} of the root mean square force and {wrong:.2g} "
-                    "kJ/mol; take another platform."
+                    "kJ/mol; use another platform."
                 )
 
     def energies_and_forces(self, positions_nm: npt.ArrayLike) -> tuple[FloatArray, FloatArray]:
@@ -362,10 +362,10 @@ class SimdReplicas:
 
     def step(self, n_steps: int) -> None:
         """Integrate. Raises SimulationError when a constraint cannot be met, or a copy is hotter than chance allows."""
-        for done in range(0, n_steps, _CENTRED_STEPS):
+        for done in range(0, n_steps, CENTRED_STEPS):
             arrays = (self._positions, self._low, self._velocities, self._random, self._room)
             at = [array.ctypes.data for array in arrays]
-            met = self._program.step(ctypes.byref(self._system), *at, min(_CENTRED_STEPS, n_steps - done))
+            met = self._program.step(ctypes.byref(self._system), *at, min(CENTRED_STEPS, n_steps - done))
             if met:
                 raise SimulationError("a copy of the molecule blew up: its constraints cannot be met")
             self._place(_outwards(self._positions) + _outwards(self._low))

@@ -118,7 +118,7 @@ def read_terms(system: Any, biased: Sequence[Sequence[int]], width: int) -> Term
 
 
 def _unknown(what: str) -> SimdUnavailableError:
-    return SimdUnavailableError(f"platform simd knows no {what}; take another platform.")
+    return SimdUnavailableError(f"platform simd does not support {what}; use another platform.")
 
 
 def _integers(rows: Any, width: int) -> IntArray:
@@ -160,7 +160,7 @@ def _bonded(system: Any, place: IntArray, n_solute: int) -> dict[str, Any]:
             for k in range(force.getNumTorsions()):
                 *quad, period, phase, stiff = force.getTorsionParameters(k)
                 if period > _PERIODS:
-                    raise _unknown(f"torsion of period {period}")
+                    raise _unknown(f"torsions of period {period}")
                 quad = [int(place[a]) for a in quad]
                 row = torsions[min(tuple(quad), tuple(quad[::-1]))]
                 row[0] += stiff._value
@@ -231,7 +231,7 @@ def _add_water(terms: Terms, force: Any, system: Any, constraints: list[Any], ma
     n_solute, n_waters = terms.n_solute, terms.n_waters
     wet = slice(n_solute, None)
     if not n_waters:
-        raise _unknown("periodic cell without rigid three-site water")
+        raise _unknown("a periodic cell without rigid three-site water")
     for values in (charge, sigma * (epsilon > 0), epsilon, masses[terms.order]):
         rows = values[wet].reshape(-1, 3)
         if np.ptp(rows, axis=0).max() > 1e-9 or abs(rows[0, 1] - rows[0, 2]) > 1e-9:
@@ -239,7 +239,7 @@ def _add_water(terms: Terms, force: Any, system: Any, constraints: list[Any], ma
     if epsilon[n_solute + 1] > 0:
         raise _unknown("water whose hydrogens have Lennard-Jones terms")
     if force.getUseSwitchingFunction():
-        raise _unknown("switching function")
+        raise _unknown("a switching function")
     terms.cell_nm = np.array([list(v._value) for v in system.getDefaultPeriodicBoxVectors()], dtype=np.float64)
     cutoff = force.getCutoffDistance()._value
     place = np.empty(len(charge), np.int64)
@@ -257,7 +257,7 @@ def _add_water(terms: Terms, force: Any, system: Any, constraints: list[Any], ma
     cell = terms.cell_nm
     ewald = force.getNonbondedMethod() == force.PME
     if not ewald and force.getNonbondedMethod() != force.CutoffPeriodic:
-        raise _unknown("Ewald sum but PME")
+        raise _unknown("Ewald sums other than PME")
     alpha, grid = _pme(force, cell) if ewald else (0.0, (0, 0, 0))
     own = COULOMB * np.outer(charge[n_solute : n_solute + 2], charge[n_solute : n_solute + 2])
     oxygen = n_solute
@@ -346,7 +346,7 @@ def _pme(force: Any, cell: FloatArray) -> tuple[float, tuple[int, int, int]]:
     for n in points:
         n = next(m for m in range(int(n), 2 * _MOST_POINTS) if math.prod(factorised(m)) == m)
         if n > _MOST_POINTS:
-            raise _unknown(f"PME grid of {n} points")
+            raise _unknown(f"a PME grid of {n} points")
         found.append(n)
     return float(alpha), (found[0], found[1], found[2])
 
@@ -431,8 +431,8 @@ def _within_solute(
         a, b, q, s, e = force.getExceptionParameters(k)
         i, j = sorted((int(place[a]), int(place[b])))
         if j >= n_solute:
-            if i < n_solute or (i // 3 != j // 3 and (i - n_solute) // 3 != (j - n_solute) // 3):
-                raise _unknown("exception between molecules of water")
+            if i < n_solute or (i - n_solute) // 3 != (j - n_solute) // 3:
+                raise _unknown("exceptions between molecules of water")
             continue
         apart.append((i, j))
         terms.append((COULOMB * q._value, *_lennard_jones(s._value, e._value), COULOMB * rounded[i] * rounded[j]))

@@ -390,8 +390,9 @@ def refuse_trained_on(
     trained = list(_sources(weights.provenance))
     for path, source in zip([*reference, *replicate], frames.sources, strict=True):
         for other in trained:
-            same_frames = other.get("sha256") == source["sha256"]
-            same_run = not domain.further and source["seed"] is not None and other.get("seed") == source["seed"]
+            same_frames = any(other.get(key) == source[key] for key in ("sha256", "shape_sha256"))
+            same_run = source["seed"] is not None and other.get("seed") == source["seed"]
+            same_run &= other.get("topology") in (None, source["topology"])
             if same_frames or same_run:
                 raise InputError(
                     f"{path}: {name} was trained on this run (seed {other.get('seed')}, then called "

@@ -30,6 +30,7 @@ from systems.errors import InputError, OutOfDomainError, SimulationError, Storag
 from systems.files.whole_file import create_whole
 from systems.library.named_scenes import prepare
 from systems.scene import FloatArray, IntArray, Scene, part_of
+from systems.trajectory.checkpoint import checkpoint_path
 from systems.trajectory.codec import open_trajectory
 
 Frames = npt.NDArray[np.floating[Any]]
@@ -191,7 +192,10 @@ def measure_length(
     row: dict[str, Any] = {"guard": guard, "replicas": replicas, "frames": n_frames}
     config = RolloutConfig(time_ps=-(-n_frames // replicas) * lag_ps, seed=seed, guard=guard)
     try:
-        rollout(scene, weights, outs, config, resume=True)
+        if _was_stopped(outs, weights, seed):
+            row["outcome"] = "stopped by the guards when it was rolled before"
+        else:
+            rollout(scene, weights, outs, config, resume=True)
     except SimulationError as error:  # stopped by the guards: what came before is evaluated
         row["outcome"] = str(error)
         if not all(path.exists() for path in outs):
@@ -210,6 +214,15 @@ def measure_length(
     if min(map(len, found)) == 0:
         return row
     return row | measure_validity(found, geometry) | measure_drift(found, scene, geometry)
+
+
+def _was_stopped(outs: Sequence[Path], weights: Weights, seed: int) -> bool:
+    """Whether these files are all there is of a rollout that ended before its time."""
+    if checkpoint_path(outs[0]).exists() or not all(path.exists() for path in outs):
+        return False
+    with open_trajectory(outs[0]) as reader:
+        record = reader.record
+    return record.get("completed") is False and (record["weights_hash"], record["seed"]) == (weights.hash, seed)
 
 
 def odd_scenes(weights: Weights, seed: int) -> Iterator[tuple[str, Scene]]:
@@ -285,9 +298,6 @@ def measure_openmm(weights: Weights, *, n_frames: int, seed: int = 0) -> list[di
                     frames[k] = state.positions_nm
                     energies[k], temperatures[k] = state.potential_kj_mol, state.temperature_k
             speed = {"frames_per_cpu_s": len(frames) / max(time.process_time() - started, 1e-9)}
-        except KeyError as error:
-            rows.append({**row, "outcome": f"not run: the weights do not say their {error}"})
-            continue
         except SurromdError as error:
             rows.append({**row, "outcome": str(error)})
             continue

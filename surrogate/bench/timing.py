@@ -27,6 +27,7 @@ from surrogate.models.weights import TrainingDomain, Weights
 from surrogate.sampling.chunks import ChunkSampler, noise_seed
 from surrogate.training.devices import product_speed
 from surrogate.verbs.options import CostErrorConfig
+from systems.errors import InputError
 from systems.scene import FloatArray
 
 Frames = npt.NDArray[np.float64]
@@ -145,9 +146,11 @@ def _spread(values: Sequence[float], shares: Sequence[float] | None = None) -> d
 
 @contextmanager
 def openmm_of(domain: TrainingDomain, timestep_ps: float, seed: int) -> Iterator[Engine]:
-    """Yield OpenMM under the conditions of training, minimised and with velocities. Raises KeyError where the domain
+    """Yield OpenMM under the conditions of training, minimised and with velocities. Raises InputError where the domain
     does not say one of these, and what `Engine` raises."""
     given = {name: value for name, value in domain.conditions.items() if value is not None}
+    if missing := [name for name in ("force_field", "solvent", "temperature_k") if name not in given]:
+        raise InputError(f"the weights do not say their {' and '.join(missing)}; give weights of training that do.")
     conditions = Conditions(
         force=resolve(domain.scene, ForceFieldSpec.of(given)),
         temperature_k=given["temperature_k"],
@@ -170,7 +173,7 @@ def _by_simd(weights: Weights, config: CostErrorConfig) -> SimdReplicas | None:
             system, temperature_k=given["temperature_k"], friction_per_ps=given.get("friction_per_ps") or 1.0,
             timestep_ps=TIMESTEP_PS, seed=config.seed,
         )  # fmt: skip
-    except (KeyError, SimdUnavailableError):
+    except SimdUnavailableError:
         return None
     simd.check(system, scene.positions_nm)
     simd.set_positions(np.repeat(scene.positions_nm[None], simd.n_replicas, axis=0))

@@ -87,7 +87,7 @@ def _one_line(entry: Any) -> str:
         return str(entry)
     if "what" in entry:
         saves = f" ({entry['saves']})" if entry.get("saves") else ""
-        return f"{entry['what']}: {entry['why']}{saves}"
+        return f"{entry['what']}: {entry.get('why') or entry.get('reason')}{saves}"
     return ", ".join(f"{key} {_plain(value)}" for key, value in entry.items())
 
 

@@ -183,13 +183,12 @@ def compare(
     reference: Ensemble,
     candidates: Sequence[Ensemble],
     replicate: Ensemble | None = None,
-    scene: Scene | None = None,
     *,
     options: Options | None = None,
 ) -> Comparison:
     """Evaluate each candidate against the reference, beside a replicate of equal length.
 
-    All ensembles must hold the atoms of `scene` (the reference's by default) in its order, or some of them, named in
+    All ensembles must hold the atoms of the reference's scene in its order, or some of them, named in
     `Ensemble.kept`: then all are compared on the atoms that they share. Without a replicate the
     reference is cut in two halves, the second serving as the replicate of the first. Each candidate is evaluated by
     itself, at the longest length that it shares with reference and replicate: adding a candidate changes no other's
@@ -198,7 +197,7 @@ def compare(
     if not candidates:
         raise InputError("Nothing to compare with the reference: give at least one trajectory.")
     options = options or Options()
-    whole = scene or reference.scene
+    whole = reference.scene
     everyone = [reference, *candidates, *([] if replicate is None else [replicate])]
     thinned, kept = alike(everyone)
     # Torsions and rings are found in the whole molecule; only hydrogens or side chains may be missing.
@@ -211,6 +210,9 @@ def compare(
     for ensemble in (ref,) if rep is None else (ref, rep):
         _topology_note(ensemble, stage, refuse=True)
     baseline = Baseline.of(ref, parent=whole, kept=kept)
+    n_angles = len(baseline.torsions.phi) + len(baseline.torsions.psi)
+    n_rows = _ROWS_FORESEEN + 8 * min(n_angles, 2 * FEW_RESIDUES)
+    options = replace(options, n_permutations=max(options.n_permutations, 50 * n_rows))
     measured = [baseline.measure(e) for e in thinned]
     notes = [note for e in thinned for note in e.notes]
     notes += [note for e in rolled if (note := _topology_note(e, stage, refuse=False))]
@@ -234,6 +236,7 @@ def compare(
     if not isinstance(temperature_k, (int, float)):
         temperature_k = 300.0
         notes.append("The reference does not state its temperature; free energies are drawn for 300 K.")
+    notes += _other_conditions(reference, everyone[1:])
     summaries = [summary_of(e) for e in everyone]
     setting = _Setting(
         stage, baseline.torsions, baseline.geometry, first, second, options, float(temperature_k), summaries[0], {},
@@ -287,7 +290,7 @@ def _evaluate(setting: _Setting, candidate: Features, summary: Summary, turned: 
     left_open = explain(setting.known, candidate, setting.torsions, setting.convergence, seed=options.seed)
     if effective_samples(n_compared, correlation) < verdict.LEAST_FOR_TESTS or left_open.why:
         found_rows = verdict.untested(found_rows, start=bool(left_open.why))
-    rows = verdict.evaluated_rows(by_group([*found_rows, *(x.row() for x in left_open.excess)]), options)
+    rows = verdict.evaluated_rows(by_group([*found_rows, *(x.row() for x in left_open.excess)]))
     found = verdict.findings(rows)
     slowest = max(correlation, own)
     cautions = verdict.cautions_of(inputs, slowest, left_open.in_words(setting.convergence))
@@ -322,7 +325,7 @@ def _evaluate(setting: _Setting, candidate: Features, summary: Summary, turned: 
         notes=(
             *_trimming(inputs, reference, candidate, replicate),
             *(["Equivalent MD time is withheld: it takes a converged reference."] if left_open.why else []),
-            *verdict.unlike(rows, options),
+            *verdict.unlike(rows),
             *copied_from(inputs)[1],
         ),
         charts=(*equivalent_time_charts(times), *charts),
@@ -349,8 +352,7 @@ def _equal_terms(setting: _Setting, candidate: Features) -> tuple[ComparisonInpu
     slowest = longest_correlation(cut[0], cut[2])
     own = longest_correlation(cut[1])
     each = block_length(n, max(slowest, own))
-    n_rows = _ROWS_FORESEEN + 8 * min(len(torsions.phi) + len(torsions.psi), 2 * FEW_RESIDUES)
-    options = replace(setting.options, n_permutations=max(setting.options.n_permutations, 50 * n_rows))
+    options = setting.options
     samples = [make_sample(f, make_blocks(f.segment_lengths, each), options, stream, n) for stream, f in enumerate(cut)]
     inputs = ComparisonInput(
         setting.scene, torsions, setting.geometry, samples[0], samples[1], samples[2], options, setting.temperature_k,
@@ -363,10 +365,30 @@ def _trimming(inputs: ComparisonInput, *trajectories: Features) -> list[str]:
     """Return which trajectories are longer than the equal length at which distances are taken."""
     return [
         f"{f.label}: the first {f.frames(0, round(inputs.compared_ps / f.lag_ps)).length_words} of {f.length_words} "
-        "are used for the distances, at equal length; all of it for the tests."
-        for f in trajectories
+        f"are used for the distances, at equal length; {_tested(f, s)} for the tests."
+        for f, s in zip(trajectories, inputs.samples, strict=True)
         if f.total_ps > inputs.compared_ps
     ]
+
+
+def _tested(whole: Features, sample: Sample) -> str:
+    n = sample.features.n_frames
+    return "all of it" if n == whole.n_frames else f"the first {sample.features.length_words}"
+
+
+def _other_conditions(reference: Ensemble, others: Sequence[Ensemble]) -> list[str]:
+    """Return which trajectories were made under other conditions than the reference, where both say so."""
+    said = []
+    for other in others:
+        for key, name in (
+            ("force_field", "force field"),
+            ("solvent", "solvent"),
+            ("temperature_k", "temperature in K"),
+        ):
+            own, ref = other.record.get(key), reference.record.get(key)
+            if own is not None and ref is not None and own != ref:
+                said.append(f"{other.label} was made at another {name} than the reference: {own}, not {ref}.")
+    return said
 
 
 def _topology_note(ensemble: Ensemble, scene: Scene, *, refuse: bool) -> str:
@@ -386,8 +408,8 @@ def _topology_note(ensemble: Ensemble, scene: Scene, *, refuse: bool) -> str:
         return ""
     worst = int(long[np.argmax(length[long])])
     name = bond_label(scene, int(i[worst]), int(j[worst]))
-    such_as = f"{name} of {10 * length[worst]:.2g} Å"
-    said = f"{ensemble.label}: {len(long)} of {len(length)} bonds are no bonds, such as {such_as}"
+    such_as = f"{name} at {10 * length[worst]:.2g} Å"
+    said = f"{ensemble.label}: {len(long)} of {len(length)} bonds are too long to be bonds, e.g. {such_as}"
     if refuse and len(long) >= max(_REFUSED[0], _REFUSED[1] * len(length)):
         raise InputError(
             f"{said}. The topology does not fit the coordinates, whose atoms are in another order; name the one that "

@@ -19,12 +19,11 @@ import numpy as np
 from surrogate.comparison.measure import kinetics
 from surrogate.comparison.measure.distributions import divergence
 from surrogate.comparison.measure.slow_motion import angles_of, tic_0
-from surrogate.comparison.measure.statistics import Estimate, FloatArray
+from surrogate.comparison.measure.statistics import Estimate, FloatArray, Segments
 from surrogate.comparison.measure.structure import Backbone, Baseline, Features, evenly
 from surrogate.comparison.measure.torsions import Wells, find_wells
 from surrogate.comparison.read.ensemble import Ensemble, length_words
 from surrogate.comparison.rows.rows import Row
-from systems.scene import Scene
 from systems.units import format_time_ps
 
 # A replica shorter than so many relaxation times remembers its start, whatever the starts are.
@@ -109,6 +108,8 @@ class Convergence:
     @property
     def verdict(self) -> str:
         """One sentence: converged or not, and why."""
+        if not self.n_replicas:
+            return f"too short to test: {self.reasons[0]}."
         if self.converged:
             return f"{self.length}: no sign that it still depends on where it started."
         more = f"; {len(self.reasons) - _MENTIONED} more" if len(self.reasons) > _MENTIONED else ""
@@ -117,28 +118,26 @@ class Convergence:
 
     @property
     def remedy(self) -> str:
-        """What would tell; empty where it is converged."""
+        """What would settle it; empty where it is converged."""
         if self.converged:
             return ""
+        if not self.n_replicas:
+            return "longer replicas would settle it"
         if apart := {s.torsion for s in self.states if s.entries == s.exits == 0 and 0 < s.started < self.n_replicas}:
             either = ", ".join(sorted(apart)[:_MENTIONED])
-            return f"replicas began on either side of {either}, and none crossed: far longer ones would tell"
+            return f"replicas began on either side of {either}, and none crossed: far longer ones would settle it"
         if self.needed_ps is None:
-            return "starts spread over all states would tell; longer replicas from the same start may not"
-        return f"replicas of {format_time_ps(self.needed_ps, 2)} or more would tell, or starts spread over all states"
+            return "starts spread over all states would settle it; longer replicas from the same start may not"
+        longer = f"replicas of {format_time_ps(self.needed_ps, 2)} or more"
+        return f"{longer}, or starts spread over all states, would settle it"
 
 
-def tested_reference(trajectories: Sequence[Ensemble], scene: Scene | None = None, *, seed: int = 0) -> Convergence:
-    """Return whether trajectories of one simulation (replicas, or several sets of them) have forgotten their start.
-
-    Args:
-        trajectories: ensembles with the same atoms and the same time between frames.
-        scene: whose torsions are followed; the first trajectory's by default.
-        seed: of the random reversals of time.
-    """
+def tested_reference(trajectories: Sequence[Ensemble]) -> Convergence:
+    """Return whether trajectories of one simulation (replicas, or several sets of them, with the same atoms and the
+    same time between frames) have forgotten their start."""
     first = trajectories[0]
-    baseline = Baseline.of(first, parent=scene or first.scene, kept=first.kept)
-    return convergence_of([baseline.measure(t) for t in trajectories], baseline.torsions, seed=seed)
+    baseline = Baseline.of(first, parent=first.scene, kept=first.kept)
+    return convergence_of([baseline.measure(t) for t in trajectories], baseline.torsions)
 
 
 def convergence_of(
@@ -208,9 +207,8 @@ def state_columns(
 ) -> list[Column]:
     """Return every state of every angle that has two or more."""
     columns = []
-    found = evenly(angles_of(features, torsions), _MOST_TORSIONS) if features else []
-    for k, (name, segments) in enumerate(found):
-        well = find_wells(segments) if wells is None else wells[k]
+    for k, (name, segments, fold) in enumerate(_followed(features, torsions) if features else []):
+        well = find_wells(segments, fold=fold) if wells is None else wells[k]
         if len(well.names) < 2:
             continue
         assigned = well.assign(segments)
@@ -219,6 +217,15 @@ def state_columns(
             for state, text in enumerate(well.names)
         ]
     return columns
+
+
+def _followed(features: Sequence[Features], torsions: Backbone) -> list[tuple[str, Segments, int]]:
+    """Return the angles that are followed: name, values in rad, and by how many equal positions these are folded."""
+    probes = features[0].probes
+    further = [t.fold for t in probes.torsions] if probes else []
+    found = angles_of(features, torsions)
+    folds = [1] * (len(found) - len(further)) + further
+    return evenly([(name, values, n) for (name, values), n in zip(found, folds, strict=True)], _MOST_TORSIONS)
 
 
 def long_enough(sets: Sequence[Features]) -> list[Features]:
@@ -327,7 +334,7 @@ def _evaluated(column: Column, drift_p: float, lag_ps: float, n_tests: int) -> S
         low, high = (0.0, 1.0) if fault else (low, high)
     moves = not column.is_state or float(np.ptp(by_quarter)) > _LEAST_BIAS
     if not fault and moves and drift_p < _SIGNIFICANCE:
-        words = ", ".join(f"{100 * q:.2g}" for q in by_quarter)
+        words = ", ".join(f"{100 * q:.3g}" for q in by_quarter)
         fault = f"{label} drifts: {words} % by quarters" if column.is_state else f"{label} drifts along the replicas"
         low, high = (low, 1.0) if by_quarter @ _CONTRAST > 0 else (0.0, high)
     elif not fault and common and replica < LEAST_RELAXATIONS * tau:
@@ -387,8 +394,7 @@ def _summed_up(states: Sequence[State], map_p: float, lengths: Sequence[int], la
     slowest_ps = slowest.relaxation_ps if slowest else math.nan
     # A time that is as long as the replicas is none that was seen; what never moved has none.
     seen = slowest is not None and slowest_ps < 0.5 * replica_ps
-    blind = any(s.entries == 0 == s.exits or (s.entries or 0) + (s.exits or 0) < LEAST_PASSAGES
-                for s in faulty if s.entries is not None)  # fmt: skip
+    blind = any((s.entries or 0) + (s.exits or 0) < LEAST_PASSAGES for s in faulty if s.entries is not None)
     return Convergence(
         converged=not reasons,
         reasons=tuple(reasons),
@@ -435,7 +441,7 @@ class Excess:
             tolerance=100 * _TOLERANCE,
             tolerance_text="± 5 points",
             statement=f"{s.label} is held {100 * self.share:.3g} % of the time, where the reference allows "
-            f"{100 * self.low:.2g} to {100 * self.high:.2g} %, whatever it has not converged in",
+            f"{100 * self.low:.3g} to {100 * self.high:.3g} %, whatever it has not converged in",
         )
 
 
@@ -471,8 +477,8 @@ def explain(
     theirs, own = long_enough(reference), long_enough([candidate])
     if not theirs or not own:
         return Explained(found.reasons)
-    pairs = zip(*(evenly(angles_of(x, torsions), _MOST_TORSIONS) for x in (theirs, own)), strict=True)
-    wells = [find_wells(a, b) for (_, a), (_, b) in pairs]
+    pairs = zip(*(_followed(x, torsions) for x in (theirs, own)), strict=True)
+    wells = [find_wells(a, b, fold=fold) for (_, a, fold), (_, b, _) in pairs]
     references, mine = state_columns(theirs, torsions, wells), state_columns(own, torsions, wells)
     total_ps = sum(f.total_ps for f in theirs)
     unseen, outside = [], [np.zeros(len(x), dtype=np.bool_) for x in mine[0].series] if mine else []
@@ -514,10 +520,11 @@ def _unseen(ref: Column, column: Column, found: Convergence, total_ps: float, la
     if expected >= _ENTRIES_TO_RULE_OUT and entries <= expected / _TIMES_FEWER:
         return ""
     times = "once" if entries == 1 else f"{entries} times" if entries else "never"
-    return (
-        f"{ref.torsion} {ref.name}, {100 * column.share:.2g} % of the candidate, is {times} entered in "
-        f"{found.length}, which by the candidate's own rates would enter it {expected:.2g} times"
-    )
+    share = f"{100 * column.share:.3g} % of the candidate"
+    said = f"{ref.torsion} {ref.name}, {share}, is {times} entered in {found.length}"
+    if not expected:
+        return f"{said}, and the candidate, which began in it, never enters it either"
+    return f"{said}, which by the candidate's own rates would enter it {expected:.2g} times"
 
 
 def _dependence(ref: Column, other: Column) -> float:

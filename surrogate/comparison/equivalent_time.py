@@ -43,6 +43,7 @@ _NORMAL_95 = 1.959964
 SHORTEST_SHARE = 128
 _LEAST_FRAMES = 10
 _LAGS = 40
+_DRAWS = 400
 
 
 @dataclass(frozen=True)
@@ -101,10 +102,10 @@ class Measure(NamedTuple):
         ends = (self.sums[0].sum(0), self.sums[2].sum(0))
         return np.asarray(np.mean([self.squared(sums, end) for end in ends], axis=0))
 
-    def own_draws(self, seed: int, n_draws: int) -> FloatArray:
+    def own_draws(self, seed: int) -> FloatArray:
         """Return the candidate's squared distance in every bootstrap draw of its blocks, `(n_draws,)`."""
         own = self.sums[1]
-        return self.to_references(bootstrap_weights(len(own), n_draws, np.random.default_rng([seed, 7])) @ own)
+        return self.to_references(bootstrap_weights(len(own), _DRAWS, np.random.default_rng([seed, 7])) @ own)
 
 
 def errors_by_length(measure: Measure, length_ps: float) -> tuple[FloatArray, FloatArray]:
@@ -125,15 +126,15 @@ def _logs_by_length(n_blocks: int, squared: Callable[[int], FloatArray]) -> list
     return [(n, logs) for n, logs in found if len(logs)]
 
 
-def distance_to_reference(measure: Measure, seed: int = 0, n_draws: int = 400) -> Estimate:
+def distance_to_reference(measure: Measure, seed: int = 0) -> Estimate:
     """Return the candidate's distance to the reference (the root mean square of those to reference and replicate) with
     its 95 % interval: block bootstrap of the candidate alone."""
     own = measure.sums[1]
     value = math.sqrt(float(measure.to_references(own.sum(0)[None])[0]))
-    return distance_estimate(value, np.sqrt(measure.own_draws(seed, n_draws)), len(own))
+    return distance_estimate(value, np.sqrt(measure.own_draws(seed)), len(own))
 
 
-def equivalent_time_by(measure: Measure, length_ps: float, seed: int = 0, n_draws: int = 400) -> EquivalentTime | None:
+def equivalent_time_by(measure: Measure, length_ps: float, seed: int = 0) -> EquivalentTime | None:
     """Return the equivalent MD time by one measure; `length_ps` is that of reference and of replicate. None when it
     has no value.
 
@@ -167,7 +168,7 @@ def equivalent_time_by(measure: Measure, length_ps: float, seed: int = 0, n_draw
     # Where pieces are few their scatter is not known; it grows with length as rare events come in one by one.
     spread = np.maximum.accumulate(np.nan_to_num(scatter, nan=0.0))
     of_mean = float(np.interp(at, log_lengths, spread / np.sqrt(counts)))
-    draws = measure.own_draws(seed, n_draws)
+    draws = measure.own_draws(seed)
     draws = draws[np.isfinite(draws) & (draws > 0)]
     few = len(draws) < 2 or len(own) < 2
     bootstrapped = math.inf if few else float(np.log(draws).std()) * math.sqrt(len(own) / (len(own) - 1))

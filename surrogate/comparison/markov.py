@@ -135,8 +135,8 @@ def equilibrium(micro: Sequence[IntArray], *, lag: int | None = None, seed: int 
     frames, None for the shortest at which the slowest timescale is flat. Where every replica is twenty times as long as
     the slowest process, plain averages. Raises InputError where there is nothing to count.
     """
-    micro = [np.asarray(m, dtype=np.int64) for m in micro if len(m) > 1]
-    if not micro or max(m.max() for m in micro) < 0:
+    micro = [np.asarray(m, dtype=np.int64) for m in micro]
+    if max((int(m.max()) for m in micro), default=-1) < 0:
         raise InputError("there are no frames in any state, and so no equilibrium to tell; give longer replicas.")
     n_micro = 1 + max(int(m.max()) for m in micro)
     rng = np.random.default_rng(seed)
@@ -366,11 +366,11 @@ def reversible(counts: FloatArray, settled: float = 0.0) -> tuple[FloatArray, Fl
     return flux / total[:, None], total / total.sum()
 
 
-def _timescales(matrix: FloatArray, stationary: FloatArray, lag: int, most: int = 5) -> tuple[FloatArray, FloatArray]:
-    """Return the slowest timescales, descending, and their eigenfunctions `(n_states, k)`."""
+def _timescales(matrix: FloatArray, stationary: FloatArray, lag: int) -> tuple[FloatArray, FloatArray]:
+    """Return the five slowest timescales, descending, and their eigenfunctions `(n_states, k)`."""
     root = np.sqrt(np.maximum(stationary, 1e-300))
     values, vectors = np.linalg.eigh(0.5 * ((root[:, None] * matrix / root) + (root[:, None] * matrix / root).T))
-    order = np.argsort(-values)[1 : 1 + most]
+    order = np.argsort(-values)[1:6]
     with np.errstate(divide="ignore"):
         times = -lag / np.log(np.clip(values[order], 1e-6, 1 - 1e-12))
     return times, vectors[:, order] / root[:, None]

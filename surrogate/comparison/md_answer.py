@@ -38,7 +38,6 @@ from systems.errors import InputError
 from systems.scene import Scene
 from systems.units import GAS_CONSTANT_KJ_MOL_K, format_time_ps
 
-_TICA_LAG_PS = 10.0
 _DIMENSIONS, _MICROSTATES, _FRAMES_A_MICROSTATE = 8, 100, 50
 _MAP_BINS = 36
 # Torsions that have states: of a ring its pucker.
@@ -204,7 +203,7 @@ class Answer:
             use = f"Do not use {self.whose} {shown} yet."
         else:
             use = "Use the reweighted rollout" if self.is_reweighted else "Use MD's answer"
-            use += ", but for what it did not connect." if self.missing else "."
+            use += ", except for states that no transitions connect." if self.missing else "."
             what = f"For populations and free energies of {len(weighted)} states, each to {widest:.2g} % or better"
             what += " (one standard error)" + (", and relaxation times." if self.relaxation_ps else ".")
         missing = f" Missing{' in MD' * self.is_joint}: {'; '.join(self.missing)}." if self.missing else ""
@@ -256,7 +255,7 @@ class Answer:
     def to_dict(self) -> dict[str, Any]:
         """Return JSON-able values; weights are in the trajectories."""
         found = {key: value for key, value in vars(self).items() if key not in ("weights", "states", "maps")}
-        states = [vars(s) | {"differs": s.differs} for s in self.states]
+        states = [vars(s) | {"differs": s.differs, "is_known": s.is_known} for s in self.states]
         maps = {k: [[x if math.isfinite(x) else None for x in row] for row in m.tolist()] for k, m in self.maps.items()}
         own = {
             "in_short": list(self.in_short),
@@ -338,7 +337,8 @@ def _hands(angles: list[FloatArray], lag_ps: float) -> list[BoolArray] | None:
 
 
 def _tica_lag(angles: Sequence[FloatArray], lag_ps: float) -> int:
-    return max(1, min(round(_TICA_LAG_PS / lag_ps), min(map(len, angles)) // 4))
+    """Return the lag of TICA in frames, at most a quarter of a replica."""
+    return min(kinetics.tica_lag(lag_ps), max(1, int(np.median([len(a) for a in angles])) // 4))
 
 
 def _is_its_mirror_image(scene: Scene) -> bool:
@@ -378,19 +378,17 @@ def md_answer(
     counting = None if factors is None else [*factors] * (len(micro) // len(of_md))
     own = torsions.of(surrogate) if surrogate is not None else None
     states: list[StateEnergy] = []
-    missing: list[str] = []
     named = _named_states(torsions, angles, own)
     for name, labels, names, rolled in named:
         states += _energies(found, micro, (name, names), labels, rolled, temperature_k, counting)
-    for lost in found.unconnected:
-        # What is left for good has no weight, rightly.
-        if lost.fate != "left and never entered":
-            where = _where(lost.microstates, micro, named)
-            missing.append(f"not connected: {where} was {lost.fate} ({lost.n_replicas} of {len(micro)} replicas)")
     states = [_said_missing(s) for s in states]
-    missing += [
-        f"{s.torsion} {s.state}: {s.missing}" for s in states if s.missing and (not missing or not s.n_replicas)
-    ]
+    missing = [_missing_line(s, found.n_own) for s in states if s.missing]
+    if not missing:
+        # What is left for good has no weight, rightly.
+        for lost in (x for x in found.unconnected if x.fate != "left and never entered"):
+            where = _where(lost.microstates, micro, named)
+            among = f"{lost.n_replicas} of {found.n_own} replicas"
+            missing.append(f"not connected: part of {where} was {lost.fate} ({among})")
     if found.method == "Markov model" and not missing and found.crossings == 0 and len(found.timescales):
         missing.append("the slowest process was seen in one direction only")
     ps, asked, weights = md.lag_ps, (0, 0.0), found.weights
@@ -601,6 +599,14 @@ def _said_missing(state: StateEnergy) -> StateEnergy:
         return replace(state, missing="only the surrogate was there; no MD began there")
     begun = f"{state.n_begun} replicas began there" if state.n_begun else "it was entered"
     return replace(state, missing=f"not connected: {begun}, and no way out and back was seen")
+
+
+def _missing_line(state: StateEnergy, n: int) -> str:
+    """Return what is missing of a state that some of `n` replicas may have been in."""
+    if state.n_replicas == 0:
+        return f"{state.torsion} {state.state}: {state.missing}"
+    fate = "entered and never left" if state.n_replicas > state.n_begun else "only begun in"
+    return f"not connected: {state.torsion} {state.state} was {fate} ({state.n_replicas} of {n} replicas)"
 
 
 def _own_shares(labels: list[IntArray], n: int) -> tuple[FloatArray, FloatArray]:

@@ -10,7 +10,7 @@ from typing import Literal, NamedTuple
 
 from surrogate.comparison.measure.slow_motion import rarely_crossed
 from surrogate.comparison.measure.statistics import effective_samples, holm
-from surrogate.comparison.rows.rows import UNLIKE_BELOW, ComparisonInput, Group, Options, Row, Word
+from surrogate.comparison.rows.rows import UNLIKE_BELOW, ComparisonInput, Group, Row, Word
 from surrogate.comparison.rows.validity_rows import copied_from
 from systems.chemistry import validity
 from systems.units import format_time_ps
@@ -18,6 +18,7 @@ from systems.units import format_time_ps
 Status = Literal["indistinguishable", "close", "different", "broken", "undecided"]
 
 _FAILS_AT = 10.0
+_SIGNIFICANCE = 0.05
 _SHARE_SIGNIFICANCE = 0.01
 _SEVERITY: dict[Word, int] = {"fails": 3, "differs": 2, "close": 1, "agrees": 0, "undecided": 0}
 _MENTIONED, _MENTIONED_WHY = 3, 2
@@ -58,10 +59,11 @@ def cautions_of(inputs: ComparisonInput, correlation: float, start: str = "") ->
     samples = effective_samples(round(inputs.compared_ps / inputs.lag_ps), correlation)
     if samples < LEAST_SAMPLES:
         short = (
-            f"the slowest motion is remembered for {format_time_ps(correlation * inputs.lag_ps, 2)}, which "
-            f"makes {samples:.2g} independent samples, too few to compare with ({LEAST_SAMPLES} are needed)"
+            f"the slowest motion decorrelates in {format_time_ps(correlation * inputs.lag_ps, 2)}, so there are only "
+            f"{samples:.2g} independent samples ({LEAST_SAMPLES} are needed)"
         )
-    apart = rarely_crossed((inputs.reference.features, inputs.replicate.features), inputs.candidate.features)
+    known = inputs.reference.features, inputs.replicate.features
+    apart = rarely_crossed(known, inputs.candidate.features, inputs.torsions)
     if apart:
         named = ", ".join(apart[:_MENTIONED]) + (f" and {len(apart) - _MENTIONED} more" if apart[_MENTIONED:] else "")
         lost = (
@@ -70,20 +72,17 @@ def cautions_of(inputs: ComparisonInput, correlation: float, start: str = "") ->
     return Cautions(short, lost, copied_from(inputs)[0], start)
 
 
-def evaluated_rows(rows: Sequence[Row], options: Options) -> tuple[Row, ...]:
+def evaluated_rows(rows: Sequence[Row]) -> tuple[Row, ...]:
     """Return the rows with corrected p-values (Holm over all rows) and a word each; what the words mean is in the
     report's definitions."""
     corrected = holm([math.nan if r.form == "share" else r.p_value for r in rows])
-    evaluated = [
-        replace(row, p_corrected=p, verdict=_word(row, p, options.significance))
-        for row, p in zip(rows, corrected, strict=True)
-    ]
+    evaluated = [replace(row, p_corrected=p, verdict=_word(row, p)) for row, p in zip(rows, corrected, strict=True)]
     hard = [r.verdict for r in evaluated if r.form == "share" and r.key not in (ALL_KEY, STRAINED_KEY)]
     worst: Word = max(hard, key=lambda word: _SEVERITY[word], default="agrees")
     return tuple(replace(r, verdict=worst) if r.key == ALL_KEY else r for r in evaluated)
 
 
-def _word(row: Row, p: float, significance: float) -> Word:
+def _word(row: Row, p: float) -> Word:
     if row.form == "share":
         return _share_word(row)
     value = row.candidate.value
@@ -95,7 +94,7 @@ def _word(row: Row, p: float, significance: float) -> Word:
     within = _within_tolerance(row)
     # By a distance no greater than the replicate's own nothing is off.
     beats_replicate = row.form == "distance" and row.ratio is not None and row.ratio.value <= 1.0
-    if p < significance and not beats_replicate:
+    if p < _SIGNIFICANCE and not beats_replicate:
         return "close" if within else "differs"
     if row.form == "distance":
         return "agrees" if within else "undecided"
@@ -175,10 +174,10 @@ def findings(rows: Sequence[Row]) -> tuple[str, ...]:
     return tuple(r.statement for r in bad)
 
 
-def unlike(rows: Sequence[Row], options: Options) -> list[str]:
+def unlike(rows: Sequence[Row]) -> list[str]:
     """Return a warning where the replicate itself differs from the reference (Holm over all rows)."""
     corrected = holm([math.nan if r.form == "share" else r.p_replicate for r in rows])
-    off = [r.metric for r, p in zip(rows, corrected, strict=True) if p < options.significance]
+    off = [r.metric for r, p in zip(rows, corrected, strict=True) if p < _SIGNIFICANCE]
     warning = (
         f"The replicate itself differs from the reference ({'; '.join(off)}): the two are not samples of one "
         "simulation, or too short; trust no verdict on these metrics."
@@ -215,7 +214,7 @@ def sentence(rows: Sequence[Row], found: Sequence[str], compared: str, cautions:
         "differs significantly from it.",
     }[status(rows, cautions)]
     if undecided:
-        said += f" {undecided} of {n} metrics cannot be decided: their error bars are wider than the tolerances."
+        said += f" {undecided} of {n} metrics are left undecided."
     return said
 
 
@@ -223,7 +222,7 @@ def in_short(
     rows: Sequence[Row], status: Status, findings: Sequence[str], cautions: Cautions = SURE, equivalent_time: str = ""
 ) -> tuple[str, str, str]:
     """Return the three lines: whether to use the trajectory in place of reference MD, for what, and why."""
-    good, bad, unknown = map("; ".join, _sorted(rows))
+    good, bad, unknown = map("; ".join, _sorted(rows, cautions))
     for_what = f"Right: {good or 'nothing that could be tested'}."
     for_what += f" Wrong: {bad}." if bad else ""
     for_what += f" Not known: {unknown}." if unknown else ""
@@ -232,7 +231,7 @@ def in_short(
         return "Do not use it.", "For nothing: frames are no molecules, or do not move as one.", f"Why: {why}."
     use = {
         "undecided": "Not known yet whether it can be used.",
-        "different": "Do not use it for what is wrong in it.",
+        "different": "Use it only for what is listed as right.",
         "close": "Use it within its tolerances.",
     }.get(status, "Use it.")
     if status == "undecided":
@@ -248,12 +247,14 @@ def in_short(
     return use, for_what, f"Why: {why}. {equivalent_time}".rstrip()
 
 
-def _sorted(rows: Sequence[Row]) -> tuple[list[str], list[str], list[str]]:
-    """Return what is right, what is wrong and what is not known, by the words of each group's rows."""
+def _sorted(rows: Sequence[Row], cautions: Cautions) -> tuple[list[str], list[str], list[str]]:
+    """Return what is right, what is wrong and what is not known, by the words of each group's rows. While slow motion
+    is not sampled, only what is fast can be right; of copies nothing can."""
     found: tuple[list[str], list[str], list[str]] = ([], [], [])
     for group, name in _WHAT.items():
         words = [r.verdict for r in rows if r.group == group and r.key != ALL_KEY]
         if words:
-            right = 2 * sum(w in ("agrees", "close") for w in words) >= len(words)
+            may_be = not cautions.copied and (group in ("validity", "structure") or not any(cautions))
+            right = may_be and 2 * sum(w in ("agrees", "close") for w in words) >= len(words)
             found[1 if {"differs", "fails"} & set(words) else 0 if right else 2].append(name)
     return found

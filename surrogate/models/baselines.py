@@ -188,11 +188,10 @@ def autoregression(triples: FloatArray) -> FloatArray:
     return np.stack([a, b, np.sqrt(variance * share)])
 
 
-def fit_baseline(kind: type[Baseline], frames: TrainingFrames, out: str | Path, *, n_new: int = 16,
-                 seed: int = 0) -> Path:  # fmt: skip
+def fit_baseline(kind: type[Baseline], frames: TrainingFrames, out: str | Path, *, seed: int = 0) -> Path:
     """Fit a baseline on the training part of canonical `frames` and write `out` (.safetensors). Raises InputError when
     the frames are too few."""
-    model = kind.fit(frames, n_new, np.random.default_rng(seed))
+    model = kind.fit(frames, BaselineConfig.n_new, np.random.default_rng(seed))
     domain = training_domain(frames)
     if kind is TrainingFrameResampling and domain.limits is not None:
         # Successive frames have nothing in common, so that no limit of jumps is theirs.

@@ -29,9 +29,9 @@ def fourier_features(x: Tensor, n_octaves: int) -> Tensor:
         return torch.cat([x, angles.sin(), angles.cos()], dim=-1)
 
 
-def rotary_angles(length: int, head_dim: int, *, base: float = 10_000.0) -> Tensor:
+def rotary_angles(length: int, head_dim: int) -> Tensor:
     """Return RoPE rotation angles `(length, head_dim / 2)` (Su 2021)."""
-    frequency = base ** (-torch.arange(0, head_dim, 2, dtype=torch.float32) / head_dim)
+    frequency = 10_000.0 ** (-torch.arange(0, head_dim, 2, dtype=torch.float32) / head_dim)
     return torch.arange(length, dtype=torch.float32)[:, None] * frequency[None, :]
 
 

@@ -15,6 +15,7 @@ from torch import Tensor
 from surrogate.models.architecture import ModelConfig
 from surrogate.models.propagator import Chunk, Molecule, Propagator
 from systems.chemistry.graph import beyond, bonded_graph, rotatable_torsions
+from systems.chemistry.validity import geometry_from_scene
 from systems.errors import InputError
 from systems.scene import FloatArray, Scene
 from systems.units import GAS_CONSTANT_KJ_MOL_K, whole_steps
@@ -87,10 +88,13 @@ class Bath(NamedTuple):
 
 class Turns(NamedTuple):
     """Bonds that torsion moves turn: their two atoms `ends` (k, 2), and which atoms turn with the second, `side`
-    (k, n_atoms), the fewer."""
+    (k, n_atoms), the fewer; and `pairs` (m, 2) of atoms more than three bonds apart, which overlap nearer than
+    `least_nm` (m,)."""
 
     ends: Tensor
     side: Tensor
+    pairs: Tensor
+    least_nm: Tensor
 
     @staticmethod
     def of(scene: Scene) -> Turns:
@@ -107,10 +111,18 @@ class Turns(NamedTuple):
             ):
                 ends.append((fixed, last))
                 sides.append([i in side for i in range(scene.n_atoms)])
-        return Turns(torch.tensor(ends).reshape(-1, 2), torch.tensor(sides).reshape(-1, scene.n_atoms))
+        contacts = geometry_from_scene(scene)
+        least_nm = torch.tensor(contacts.clash_pair_min_nm)
+        bonds = torch.tensor(ends).reshape(-1, 2), torch.tensor(sides).reshape(-1, scene.n_atoms)
+        return Turns(*bonds, torch.tensor(contacts.clash_idx), least_nm)
 
     def to(self, device: torch.device) -> Turns:
         return Turns(*(tensor.to(device) for tensor in self))
+
+    def overlap(self, x_nm: Tensor) -> Tensor:
+        """Return in which frames `(rows, n_atoms, 3)` atoms overlap."""
+        first, second = self.pairs.T
+        return ((x_nm[:, first] - x_nm[:, second]).norm(dim=-1) < self.least_nm).any(-1)
 
     def turned(self, x_nm: Tensor, v: Tensor, which: Tensor, angle: Tensor) -> tuple[Tensor, Tensor]:
         """Return frames and velocities `(rows, n_atoms, 3)`, each turned about bond `which` (rows,) by `angle` (rows,),
@@ -239,6 +251,8 @@ class Potential(Propagator):
                 if molecule.elements[i] == _HYDROGEN != molecule.elements[j]:
                     masses[j] -= heavy - molecule.masses_da[i]
                     masses[i] = heavy
+            if bool((masses <= 0.0).any()):
+                raise InputError(f"`hydrogen_mass_da={heavy:g}` leaves a heavy atom no mass; use less.")
         return masses
 
     def next_chunk(self, last_frames_nm: Tensor, molecule: Molecule, noise: Tensor, *, solver_steps: int = 1,
@@ -258,7 +272,7 @@ class Potential(Propagator):
             for of_frame in draws[:, :, 1:].chunk(self.n_new, dim=2):
                 turning, draw = of_frame.tensor_split([self.config.torsion_moves], dim=2)
                 if molecule.own is not None and molecule.own.turns is not None:
-                    x, v = self._turned(x, v, molecule, masses, turning[:, 0])
+                    x, v = self._turned(x, v, molecule, masses, turning)
                 x, v = move(x, v, molecule, masses, thermal, draw)
                 frames.append(x)
             found = torch.stack(frames, dim=1).to(last_frames_nm.dtype)
@@ -267,19 +281,26 @@ class Potential(Propagator):
     def _turned(self, x: Tensor, v: Tensor, molecule: Molecule, masses: Tensor, draw: Tensor) -> tuple[Tensor, Tensor]:
         """Return positions and velocities `(rows, n_atoms, 3)` after moves of Metropolis et al., J. Chem. Phys. 21,
         1087 (1953), which leave the Boltzmann distribution as it is: what is beyond one bond turns by any angle, its
-        velocities with it, and stays so with the probability exp(-dU / kT). `draw` (rows, n_moves, 3): normal numbers.
+        velocities with it, and stays so with the probability exp(-dU / kT). `draw` (rows, n_atoms, n_moves, 3): normal
+        numbers, of which those of the first two atoms are used.
+
+        No move ends where atoms overlap (`validity.CLASH_NM`), nearer than thermal frames come: there learned energies
+        have holes. This changes the populations of such states alone, which guards reject.
         """
-        turns, energies, before = molecule.own.turns, self.gradient(x, molecule), x
-        now = energies(x)[0].mean(-1)
-        for which, angle, chance in torch.special.ndtr(draw).permute(1, 2, 0):
+        turns, before, kt = molecule.own.turns, x, GAS_CONSTANT_KJ_MOL_K * self.config.temperature_k
+        # A part's velocities turn with those of all that it moves along with: with the molecule at rest as a whole,
+        # each move would cool it.
+        v = v + (kt / masses.sum()).sqrt() * draw[:, 1:2, 0]
+        now = self.gradient(x, molecule)(x)[0].mean(-1)
+        for which, angle, chance in torch.special.ndtr(draw[:, 0]).permute(1, 2, 0):
             bond = (which * len(turns.ends)).long().clamp(max=len(turns.ends) - 1)
             there, moving = turns.turned(x, v, bond, 2.0 * math.pi * angle)
-            then = energies(there)[0].mean(-1)
-            taken = chance.log() * GAS_CONSTANT_KJ_MOL_K * self.config.temperature_k < now - then
+            then = self.gradient(there, molecule)(there)[0].mean(-1)
+            taken = (chance.log() * kt < now - then) & ~turns.overlap(there)
             x, v = (torch.where(taken[:, None, None], a, b) for a, b in ((there, x), (moving, v)))
             now = torch.where(taken, then, now)
         # The centre of mass stays where it was.
-        return x + (masses / masses.sum() * (before - x)).sum(1, keepdim=True), v
+        return x + (masses / masses.sum() * (before - x)).sum(1, keepdim=True), at_rest(v, masses)
 
     def bath(self, molecule: Molecule, masses: Tensor, thermal: Tensor, timestep_ps: float | None = None) -> Bath:
         """Return the bath of the settings; `thermal`: see `langevin`."""

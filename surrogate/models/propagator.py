@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar, Self
 
@@ -140,6 +141,13 @@ class Propagator(nn.Module, ABC):
             last_velocities_nm_ps: `(b, n_atoms, 3)`, nm/ps, what the chunk before ended in, where it had velocities;
             None where a rollout begins, and a model that carries velocities draws them from its noise.
         """
+
+
+def row_by_row(draw: Callable[[Tensor, Tensor], Chunk], last_frames_nm: Tensor, noise: Tensor) -> Chunk:
+    """Return what `draw` makes of each row's frames and noise alone: of a solver whose steps suit the whole batch."""
+    rows = [draw(x, own) for x, own in zip(last_frames_nm.split(1), noise.split(1), strict=True)]
+    mean = sum(row.evaluations or 0.0 for row in rows) / len(rows)
+    return Chunk(torch.cat([row.frames_nm for row in rows]), evaluations=mean)
 
 
 def draw_noise(model: Propagator, n_atoms: int, generators: list[torch.Generator]) -> Tensor:

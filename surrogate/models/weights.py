@@ -184,18 +184,20 @@ def load_weights(path: str | Path) -> Weights:
     return Weights(model.eval().requires_grad_(False), header.domain, header.provenance, file_hash, path)
 
 
-def training_domain(
-    frames: TrainingFrames, *, stride: int = 1, strides: Sequence[int] = (), n_geometry_frames: int = 20_000
-) -> TrainingDomain:
+# Training frames that checks are measured on.
+_MEASURED_FRAMES = 20_000
+
+
+def training_domain(frames: TrainingFrames, *, stride: int = 1, strides: Sequence[int] = ()) -> TrainingDomain:
     """Return the domain of weights trained on every `stride`-th of `frames`; its checks are measured on evenly spaced
     training frames. `strides`: those of a model that takes the lag, from 1 on, for each of which jumps are measured."""
-    picked = frames.spread_starts(n_geometry_frames, stride + 1)
+    picked = frames.spread_starts(_MEASURED_FRAMES, stride + 1)
     positions = frames.positions_nm(picked)
     geometry = geometry_from_frames(frames.scene, positions)
     limits = limits_from_frames(frames.scene, positions, frames.positions_nm(picked + stride))
     jumps = []
     for wide in strides:
-        picked = frames.spread_starts(n_geometry_frames, wide + 1)
+        picked = frames.spread_starts(_MEASURED_FRAMES, wide + 1)
         found = limits_from_frames(frames.scene, frames.positions_nm(picked), frames.positions_nm(picked + wide))
         jumps.append((frames.lag_ps * wide, found.jump_min_nm, found.jump_max_nm))
     return TrainingDomain(frames.scene, frames.lag_ps * stride, frames.conditions, geometry.to_dict(), limits.to_dict(),

@@ -322,6 +322,8 @@ def timed(seconds: dict[str, float], what: str) -> Iterator[None]:
         seconds[what] = seconds.get(what, 0.0) + perf_counter() - started
 
 
+# Why a rollout stops whose numbers are none.
+BLOWN_UP = "the coordinates became NaN or infinite"
 MOST_DRAWS = 8
 _DRAWS_FROM_LAST_VALID = 4
 MOST_MD_IN_A_ROW = 10
@@ -385,9 +387,10 @@ def none_through(tallies: Sequence[Tally], n_new: int, *, at_end: bool) -> tuple
     reasons: Counter[str] = Counter()
     for tally in tallies:
         reasons.update(tally.reasons)
-    which = f"every one of {chunks} chunks" if chunks > 1 else "its one chunk"
-    named = ", ".join(name for name, _ in reasons.most_common())
-    return row, f"{which} was caught ({100 * frames / (chunks * n_new):.0f} % of frames: {named})"
+    named, share = ", ".join(name for name, _ in reasons.most_common()), f"{100 * frames / (chunks * n_new):.0f} %"
+    if chunks == 1:
+        return row, f"the only chunk contains invalid frames ({share}: {named})"
+    return row, f"every one of {chunks} chunks was caught ({share} of frames: {named})"
 
 
 @dataclass(eq=False)
@@ -461,7 +464,7 @@ class Interventions:
             return
         for row in range(len(self.state.last_frames)):
             if self.chunk.flags[row, -1] & validity.NOT_FINITE or not np.isfinite(self.chunk.frames_nm[row, -1]).all():
-                self.chunk.failure = (row, "the model's frames are no longer finite")
+                self.chunk.failure = (row, BLOWN_UP)
                 continue
             invalid = (self.chunk.flags[row] & np.uint16(validity.INVALID | validity.STILL)).all()
             tally = self.state.tallies[row]

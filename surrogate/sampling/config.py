@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
+from systems.errors import InputError
 from systems.options import check_options, option
 
 # What is done about a frame that the guards catch: nothing and no stop at all; marked; the chunk drawn again; relaxed
@@ -38,7 +39,7 @@ class RolloutConfig:
         choices=GUARDS,
     )
     energy_every: int = option(
-        "Interval of checks of the energy against the reference's, in frames (learned potentials); 0 for none.",
+        "Compare the energy with the reference's every N frames (learned potentials); 0 for none.",
         0,
         within=(0, None),
     )
@@ -57,7 +58,7 @@ class RolloutConfig:
         "Ensemble (learned potentials).", None, choices=("nvt", "nve"), unset="that of the weights"
     )
     anneal_ps: float = option(
-        "Length of MD at 600 K that replicas start from after cooling (learned potentials).", 0.0, within=(0.0, None)
+        "Length of simulated annealing from 600 K before the first frame (learned potentials).", 0.0, within=(0.0, None)
     )
     torsion_moves: int = option(
         "Monte Carlo moves of torsions per frame (learned potentials); populations as before, but no kinetics.",
@@ -80,6 +81,9 @@ class RolloutConfig:
 
     def __post_init__(self) -> None:
         check_options(self)
+        for name in ("temperature_k", "timestep_ps"):
+            if (value := getattr(self, name)) is not None and not value > 0.0:
+                raise InputError(f"{name} {value!r} must be greater than 0.")
 
     @property
     def bath(self) -> dict[str, Any]:

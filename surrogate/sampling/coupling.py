@@ -131,8 +131,10 @@ class PotentialChecks:
         error, spread = (float(weights.provenance.get(name, np.inf)) for name in ("energy_mae", "energy_spread"))
         self._wrong_kj_mol, self._unsure_kj_mol = WRONG_TIMES * error, UNSURE_TIMES * spread
         self._zero_kj_mol = torch.zeros(())
-        if weights.domain.limits is None:  # members that never saw the molecule have each a zero of their own for it
-            start = torch.tensor(weights.domain.scene.positions_nm[None], dtype=torch.float64)
+        # Of a molecule that they never saw members have each a zero of their own: energies count from the start.
+        self._start_nm = weights.domain.scene.positions_nm.copy() if weights.domain.limits is None else None
+        if self._start_nm is not None:
+            start = torch.tensor(self._start_nm[None], dtype=torch.float64)
             with torch.no_grad():
                 self._zero_kj_mol = self._model.energies(start, self._molecule)
 
@@ -155,5 +157,11 @@ class PotentialChecks:
         except SurromdError:
             return np.inf
 
+    @cached_property
+    def _offset_kj_mol(self) -> float:
+        found = 0.0 if self._start_nm is None else self.difference(self._start_nm)
+        return found if np.isfinite(found) else 0.0
+
     def is_wrong(self, difference_kj_mol: float) -> bool:
-        return not np.isfinite(difference_kj_mol) or abs(difference_kj_mol) > self._wrong_kj_mol
+        """Return whether a `difference` is large, or further from that of the start, where this was not trained on."""
+        return not np.isfinite(difference_kj_mol) or abs(difference_kj_mol - self._offset_kj_mol) > self._wrong_kj_mol

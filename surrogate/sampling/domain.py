@@ -23,7 +23,8 @@ from surrogate.models.peptides.model import PeptideSlide
 from surrogate.models.potential import Potential
 from surrogate.models.propagator import Propagator, draw_noise
 from surrogate.models.weights import Chemistry, TrainingDomain, Weights, load_weights, read_header
-from systems.chemistry.graph import STIFF_STEP_PS, bonded_graph, has_stiff_bond, match_atoms
+from systems.chemistry.geometry import torsion
+from systems.chemistry.graph import STIFF_STEP_PS, backbone_torsions, bonded_graph, has_stiff_bond, match_atoms
 from systems.chemistry.validity import INVALID, NOT_FINITE, Geometry, check_frames, flag_names, geometry_from_scene
 from systems.errors import InputError, OutOfDomainError
 from systems.scene import ATOMIC_NUMBERS, Scene
@@ -68,7 +69,7 @@ def cover_peptide(
     The molecule is the scene under standard names; a valid frame has the bond lengths and angles that such residues
     have on average in the training references. A residue, or an end of a chain, that no training peptide has cannot be
     forced; more residues than any of them has, with free ends or without, a residue at a free end that none has there,
-    and a strained start can.
+    a strained start and a cis peptide bond can.
     """
     try:
         standard, order = standard_peptide(scene)
@@ -93,6 +94,10 @@ def cover_peptide(
     if flags := _flags_of_start(standard.positions_nm, geometry):
         reason = f"the starting structure is unlike frames of such residues ({', '.join(flag_names(flags))})"
         found.append(Deviation("start", reason, forcible=True))
+    omega = backbone_torsions(standard)["omega"]
+    cis = np.abs(torsion(standard.positions_nm, omega)) < 0.5 * np.pi
+    if any(standard.residue_names[standard.residue_of_atom[n]] != "PRO" for n in omega[cis.reshape(-1), 2].tolist()):
+        found.append(Deviation("start", "a peptide bond is cis; training has trans ones alone", forcible=True))
     conditions = {
         key: value if all(member.conditions.get(key) == value for member in domain.members) else None
         for key, value in domain.conditions.items()
@@ -127,6 +132,8 @@ def _n_amino_acids(scene: Scene) -> int:
 
 # Copies of a molecule and chunks of MD on a potential by which its members are asked whether they know it.
 _ASKED_COPIES, _ASKED_CHUNKS = 16, 2
+# Answers that are kept: one command asks about a molecule in several baths.
+_REMEMBERED = 8
 _doubts_of: dict[tuple[object, ...], tuple[Deviation, ...]] = {}
 
 
@@ -174,11 +181,10 @@ def _doubts(scene: Scene, model: PainetPotential, known: Chemistry) -> tuple[Dev
     disagree in that MD."""
     spread, n_lost = disagreement(scene, model)
     if n_lost:
-        reason = f"{n_lost} of {_ASKED_COPIES} replicas of MD on it do not stay this molecule"
+        reason = f"the molecule breaks or changes in {n_lost} of {_ASKED_COPIES} short test runs"
     elif spread > known.spread_kj_mol_nm:
-        reason = (
-            f"members' forces differ by {spread:.3g} kJ/mol/nm in MD on it; {known.spread_kj_mol_nm:.3g} is trusted"
-        )
+        limit = f"the limit is {known.spread_kj_mol_nm:.3g}"
+        reason = f"the ensemble members' forces differ by {spread:.3g} kJ/mol/nm in short MD; {limit}"
     else:
         return ()
     return (Deviation("spread", reason, forcible=True),)
@@ -261,10 +267,13 @@ def match_domain(
     scene: Scene, weights: Weights, *, temperature_k: float | None = None, force: bool = False
 ) -> DomainMatch:
     """Return the order of a scene's atoms in the model, and what of the training domain it leaves under `force`: a
-    strained start and another temperature can be forced, another molecule or stereoisomer cannot.
+    strained start and another temperature can be forced, another molecule or stereoisomer cannot. A potential takes
+    any temperature, and its members are asked in MD at that.
 
     Raises OutOfDomainError, which says how the scene differs, what the weights cover and what to run instead.
     """
+    if isinstance(weights.model, Potential) and temperature_k not in (None, weights.model.config.temperature_k):
+        weights = in_bath(weights, {"temperature_k": temperature_k})
     name, known = weights.path.name, weights.domain.chemistry
     match = match_known(scene, weights.domain, name, _peptides(weights.model), temperature_k=temperature_k,
                         force=force)  # fmt: skip
@@ -272,11 +281,14 @@ def match_domain(
         return match
     model = in_step(weights, scene).model
     assert isinstance(model, PainetPotential)
-    asked = weights.hash, known, model.config.timestep_ps, scene.topology_hash, scene.positions_nm.tobytes()
+    asked = weights.hash, known, model.config, scene.topology_hash, scene.positions_nm.tobytes()
     if asked not in _doubts_of:  # one command asks several times, for seconds each
-        _doubts_of.clear()
+        if len(_doubts_of) >= _REMEMBERED:
+            _doubts_of.clear()
         _doubts_of[asked] = _doubts(scene, model, known)
-    found = match._replace(deviations=(*match.deviations, *_doubts_of[asked]))
+    found = match
+    if doubts := _doubts_of[asked]:
+        found = match._replace(deviations=(*match.deviations, *doubts), nearness="")
     return _refused(scene, found, weights.domain, name, force=force)
 
 
@@ -353,12 +365,12 @@ def _compare(
     if member is None and peptides is not None:
         own, order, beyond = cover_peptide(scene, domain, peptides)
         found = list(beyond)
-        new = unseen_neighbours(own.scene, domain) if not any(not d.forcible for d in found) else []
-        nearness = f"residues that it never saw side by side: {', '.join(new)}" if new else "each pair of residues seen"
+        new = ", ".join(unseen_neighbours(own.scene, domain)) if not any(not d.forcible for d in found) else ""
+        nearness = f"neighbouring residues not seen in training: {new}" if new else "each pair of residues seen"
     elif member is None and domain.chemistry is not None:
         own, found = cover_molecule(scene, domain, domain.chemistry)
         order = np.arange(scene.n_atoms)
-        nearness = "its members agree on forces of it"
+        nearness = "its ensemble members agree on the forces"
     elif member is None:
         found = [Deviation("molecule", "another one than those trained on", forcible=False)]
     else:
@@ -397,46 +409,54 @@ def choose_weights(
     `conditions`: force field and solvent that they must have been trained under, if any. Raises OutOfDomainError, which
     says what the nearest lack, when none covers the scene.
     """
-    found, refusals, levels, loaded = [], [], {}, {}
+    found, refusals, levels, loaded, at_other_k = [], [], {}, {}, False
     for name, path in shipped_weights().items():
         header = read_header(path)
         arch = architecture(header.arch)
         config = arch.config(header.config)
         peptides = config if isinstance(config, PeptideConfig) else None
+        is_potential = isinstance(arch.model, type) and issubclass(arch.model, Potential)
+        asked_k = None if is_potential else temperature_k
         general, level = header.domain.chemistry is not None, header.domain.conditions.get("force_field")
         if general and (conditions or {}).get("force_field") != level:
             with suppress(OutOfDomainError):
-                match_known(scene, header.domain, path.name, peptides, temperature_k=temperature_k)
+                match_known(scene, header.domain, path.name, peptides, temperature_k=asked_k)
                 said = f"{name}, where its level is asked for: `level='{level}'`."
                 refusals.append((True, 0, name, OutOfDomainError(said, brief=f"{name} is of another level")))
             continue
         apart = False  # of conditions
         try:
-            match = match_known(scene, header.domain, path.name, peptides, temperature_k=temperature_k)
+            match = match_known(scene, header.domain, path.name, peptides, temperature_k=asked_k)
             apart = True
             check_conditions(header.domain.conditions, conditions or {}, path.name)
             apart = False
             if general:  # by MD: last
-                loaded[name] = load_weights(path)
-                match_domain(scene, loaded[name], temperature_k=temperature_k)
+                bath = {} if temperature_k is None else {"temperature_k": temperature_k}
+                loaded[name] = in_bath(load_weights(path), bath)
+                match_domain(scene, loaded[name])
         except OutOfDomainError as error:
+            if asked_k is not None:
+                with suppress(OutOfDomainError):
+                    match_known(scene, header.domain, path.name, peptides)
+                    check_conditions(header.domain.conditions, conditions or {}, path.name)
+                    at_other_k = True
             n_reasons = 0 if general else len(error.args[0].split("; "))
             refusals.append((*((False, 0) if apart else (not error.forcible, n_reasons)), name, error))
             continue
-        is_potential = isinstance(arch.model, type) and issubclass(arch.model, Potential)
         levels[name] = header.domain.conditions.get("force_field")
         found.append((not match.seen, is_potential, not header.domain.jumps, name, path))
-    if not found:
+    # No potential, of another level, for the temperature alone.
+    if not found or (at_other_k and all(is_potential for _, is_potential, *_ in found)):
         nearest = min(refusals, key=lambda one: one[:3])[3] if refusals else OutOfDomainError("none are shipped.")
         raise OutOfDomainError(
             f"no shipped weights cover {scene.name}, and none are named. The nearest: {nearest}", brief=nearest.brief
         )
     unseen, *_, name, path = min(found)
     others = sorted(other for other, level in levels.items() if other != name and level == levels[name])
-    why = "they cover it without having seen it" if unseen else "they were trained on this molecule"
-    beside = f"; {', '.join(others)} would do, too" if others else ""
+    why = "cover this molecule although it was not in their training set" if unseen else "were trained on this molecule"
+    beside = f"; {', '.join(others)} would also work" if others else ""
     # Those that were asked know the molecule's minimum.
-    return loaded.get(name) or load_weights(path), f"weights not named, taken are the shipped {name}: {why}{beside}"
+    return loaded.get(name) or load_weights(path), f"no weights named: using the shipped {name}, which {why}{beside}"
 
 
 def check_conditions(known: Mapping[str, Any], asked: Mapping[str, Any], name: str) -> None:

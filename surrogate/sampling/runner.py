@@ -19,6 +19,7 @@ import torch
 from surrogate.models.potential import Potential
 from surrogate.models.weights import Weights
 from surrogate.sampling.chunks import (
+    BLOWN_UP,
     Chunk,
     ChunkSampler,
     Guard,
@@ -30,7 +31,8 @@ from surrogate.sampling.chunks import (
 )
 from surrogate.sampling.config import RolloutConfig as RolloutConfig
 from surrogate.sampling.coupling import Coupling, PotentialChecks
-from surrogate.sampling.domain import DomainMatch, fit_weights, in_bath
+from surrogate.sampling.domain import DomainMatch, fit_weights, in_bath, in_step
+from systems.chemistry.graph import STIFF_STEP_PS
 from systems.chemistry.validity import INVALID, Geometry, check_frames
 from systems.errors import InputError, SimulationError, first_line
 from systems.files.outside import UNREADABLE, arrays_in, check_disk
@@ -159,11 +161,15 @@ class _Rollout:
 
     def open(self, stack: ExitStack, *, resumed: bool) -> None:
         """Open the files of all replicas, to be closed with the stack."""
-        plan = self.plan
-        part = plan.scene if len(plan.kept_atoms) == plan.scene.n_atoms else part_of(plan.scene, plan.kept_atoms)
         for k, path in enumerate(self.outs):
-            writer = checkpoint.writer_at(path, part, self._record(k), self._header, k, resumed=resumed)
+            writer = checkpoint.writer_at(path, self.written, self.record(k), self._header, k, resumed=resumed)
             self._writers.append(stack.enter_context(writer))
+
+    @property
+    def written(self) -> Scene:
+        """The atoms that are written."""
+        plan = self.plan
+        return plan.scene if len(plan.kept_atoms) == plan.scene.n_atoms else part_of(plan.scene, plan.kept_atoms)
 
     def save(self) -> None:
         """Write the checkpoint."""
@@ -255,17 +261,19 @@ class _Rollout:
         done_ps = self.state.steps * plan.weights.domain.lag_ps
         at = f"after {format_time_ps(done_ps)}" if done_ps else "in its first chunk"
         if plan.config.guard in ("off", "flag"):
+            is_potential = isinstance(plan.weights.model, Potential)
             finer = "`precision='fp32'`, " if self.sampler.precision.bf16 else ""
+            finer += "a shorter `timestep_ps`, " if is_potential and reason == BLOWN_UP else ""
             advice = f"the frames are marked in {out}. Try {finer}`guard='repair'` or other weights."
-            if plan.config.guard == "flag":
+            if plan.config.guard == "flag" and reason != BLOWN_UP:
                 advice += " With `guard='off'` nothing stops it."
-            if isinstance(plan.weights.model, Potential):
+            if is_potential:
                 advice += " MD at the level of the weights may do the same: `surromd reference` tells."
         else:
             advice = f"the frames before are in {out}. Use other weights, or `surromd reference` for this molecule."
         return f"replica {row}, {at}: {reason}; {advice}"
 
-    def _record(self, replica: int) -> dict[str, Any]:
+    def record(self, replica: int) -> dict[str, Any]:
         """Return the record that a replica's file begins with; how long the run is, its frames say."""
         plan, sampler = self.plan, self.sampler
         options, weights = asdict(plan.config), plan.weights
@@ -343,9 +351,15 @@ def rollout(
     SimulationError when the guard cannot bring a chunk through (under 'flag' and 'off' the chunk is in the file,
     marked; else what came before).
     """
+    weights = in_bath(weights, config.bath)
+    if config.timestep_ps is not None and in_step(weights, scene) is not weights:
+        raise InputError(
+            f"{format_time_ps(config.timestep_ps)} is too long for a bond this stiff (triple, aldehyde, imine, =CH2, "
+            f"CH=CH, C=O in a small ring); use `timestep_ps='{1e3 * STIFF_STEP_PS:g}fs'` or less."
+        )
     weights, match = fit_weights(
-        scene, in_bath(weights, config.bath), temperature_k=config.temperature_k, force=config.force,
-        lag_ps=config.lag_ps, save_every_ps=config.save_every_ps,
+        scene, weights, temperature_k=config.temperature_k, force=config.force, lag_ps=config.lag_ps,
+        save_every_ps=config.save_every_ps,
     )  # fmt: skip
     if announce is not None:
         for line in match.input_notes(weights.path.name):
@@ -363,7 +377,7 @@ def rollout(
         asked_to_stop = stack.enter_context(deferred_interrupt())
         stack.enter_context(checkpoint.locked_outputs(outs, may_exist=resume or overwrite))
         if resume and not state_path.exists() and any(path.exists() for path in outs):
-            return _already_complete(outs, plan)
+            return _already_complete(outs, plan, sampler)
         kept = checkpoint.supported_checkpoint(state_path, outs) if resume and state_path.exists() else None
         if kept is None:
             state = _start(plan, sampler, len(outs), asked_to_stop)
@@ -465,19 +479,30 @@ def _annealed(plan: Plan, usual: ChunkSampler, start: npt.NDArray[np.float32],
     return frames
 
 
-def _already_complete(outs: Sequence[Path], plan: Plan) -> list[Path]:
-    wanted = {"weights_hash": plan.weights.hash, "seed": plan.config.seed, "save_every_ps": plan.save_every_ps}
-    for path in outs:
+# What of a record may differ between a rollout and the same one asked for again.
+_OF_ONE_RUN = ("weights", "program", "started", "completed", "precision", "precision_reason", "interventions",
+               "out_of_domain")  # fmt: skip
+
+
+def _already_complete(outs: Sequence[Path], plan: Plan, sampler: ChunkSampler) -> list[Path]:
+    run = _Rollout(plan, sampler, Progress(np.zeros(0, np.float32)), outs[0], {}, outs)
+    for replica, path in enumerate(outs):
         with open_trajectory(path) as reader:
             if not reader.record.get("completed") or reader.n_frames != plan.n_frames:
                 raise InputError(
                     f"{path} holds {reader.n_frames} of {plan.n_frames} frames but its checkpoint is gone; start again "
                     "with `overwrite=True`, or keep it under another name."
                 )
-            for key, value in wanted.items():
-                if reader.record.get(key) != value:
-                    raise InputError(
-                        f"{path} is complete, but of {key} = {reader.record.get(key)!r}, not {value!r}; take another "
-                        "name, or `overwrite=True`."
-                    )
+            known = {**reader.record, **reader.record["interventions"], **_beginning(reader.scene)}
+        wanted = {name: value for name, value in run.record(replica).items() if name not in _OF_ONE_RUN}
+        wanted |= {name: getattr(plan.config, name) for name in _OF_INTERVENTIONS} | _beginning(run.written)
+        for key in (key for key in wanted if key in known):
+            if known[key] != wanted[key]:
+                raise InputError(f"{path}: this rollout was started with {key} = {known[key]!r}, not {wanted[key]!r}.")
     return list(outs)
+
+
+def _beginning(scene: Scene | None) -> dict[str, Any]:
+    return {} if scene is None else {
+        "molecule": scene.topology_hash, "start": hashlib.sha256(scene.positions_nm.tobytes()).hexdigest()[:16]
+    }  # fmt: skip

@@ -16,7 +16,7 @@ from surrogate.models.architecture import weights_path
 from surrogate.models.potential import Potential
 from surrogate.models.propagator import Molecule
 from surrogate.models.weights import Weights, load_weights
-from surrogate.sampling.chunks import ChunkSampler, noise_seed
+from surrogate.sampling.chunks import BLOWN_UP, ChunkSampler, noise_seed
 from surrogate.sampling.config import RolloutConfig
 from surrogate.sampling.domain import fit_weights, match_domain
 from systems.chemistry.geometry import FloatArray
@@ -161,7 +161,7 @@ class Simulation:
         self._sampler = ChunkSampler(
             weights, solver_steps=options.solver_steps, solver=options.solver, precision=options.precision
         )
-        self._seed = options.seed
+        self._seed, self._force = options.seed, options.force
         self._order, self._back = match.order, np.argsort(match.order)
         self._last: npt.NDArray[np.float32]
         self._velocities: npt.NDArray[np.float32] | None
@@ -186,7 +186,7 @@ class Simulation:
     def step(self, steps: int) -> None:
         """Advance `steps` frames; reporters are called when they are due, as OpenMM does.
 
-        Raises SimulationError when the model's frames are no longer finite.
+        Raises SimulationError when the coordinates become NaN or infinite.
         """
         end = self.currentStep + int(steps)
         while self.currentStep < end:
@@ -253,6 +253,14 @@ class Simulation:
         self._velocities = None
         self._pending = np.empty((0, self.scene.n_atoms, 3), dtype=np.float32)
 
+    def _restart(self, positions_nm: npt.NDArray[np.float64]) -> None:
+        """Start anew where a rollout may begin. Raises OutOfDomainError."""
+        if positions_nm.shape == (self.scene.n_atoms, 3) and np.isfinite(positions_nm).all():
+            self.deviations = match_domain(
+                self.scene.with_positions(positions_nm), self.weights, force=self._force
+            ).deviations
+        self._begin(positions_nm)
+
     def _advance(self, n_frames: int) -> None:
         left = n_frames
         while left > 0:
@@ -270,8 +278,7 @@ class Simulation:
         frames = drawn.frames_nm[0].astype(np.float32)
         if not np.isfinite(frames).all():
             raise SimulationError(
-                f"the model's frames are no longer finite after {self._frames * self.lag_ps:g} ps; try precision "
-                "'fp32' or other weights."
+                f"{BLOWN_UP} after {self._frames * self.lag_ps:g} ps; try precision 'fp32' or other weights."
             )
         self._pending = frames
         self._last = frames[-self._sampler.n_conditioning :]
@@ -324,12 +331,14 @@ class SurrogateContext:
         return self._simulation.currentStep
 
     def setPositions(self, positions: Any) -> None:
-        """Start anew from positions `(n_atoms, 3)`, in nm where they have no unit; what was drawn ahead is dropped."""
+        """Start anew from positions `(n_atoms, 3)`, in nm where they have no unit; what was drawn ahead is dropped.
+        Raises OutOfDomainError as the constructor does: for another stereoisomer, without `force` a strained start.
+        """
         from openmm import unit
 
         if unit.is_quantity(positions):
             positions = positions.value_in_unit(unit.nanometer)
-        self._simulation._begin(np.array([tuple(row) for row in positions], dtype=np.float64))
+        self._simulation._restart(np.array([tuple(row) for row in positions], dtype=np.float64))
 
 
 # A learned potential as other programs take it: a function of positions, an OpenMM force, an ASE calculator.

@@ -45,11 +45,11 @@ def choose_precision(wanted: str, *, suits: bool = True) -> Precision:
     if wanted not in ("auto", "fp32", "bf16"):
         raise InputError(f"precision {wanted!r} is unknown; choose auto, fp32 or bf16.")
     if wanted == "bf16" and not suits:
-        raise InputError("this model integrates what bf16 would round, forces or positions; leave `precision` out.")
+        raise InputError("bf16 is too coarse for this model's forces or positions; leave `precision` out.")
     if wanted != "auto":
         return Precision(wanted == "bf16", "as asked for")
     if not suits:
-        return Precision(False, "this model is exact in fp32 alone")
+        return Precision(False, "this model runs in fp32 only")
     fp32, bf16 = product_speed()
     return Precision(bf16 >= _PAYS * fp32, f"products in bf16 are {bf16 / fp32:.2g} times as fast as in fp32 here")
 

@@ -39,7 +39,7 @@ def compare(
     from surrogate.comparison.comparison import compare as evaluate
     from surrogate.comparison.read.ensemble import load_ensemble
 
-    if isinstance(candidates, str | Path):
+    if isinstance(candidates, str) or not isinstance(candidates, Sequence):
         candidates = [candidates]
     labels = [options.labels] if isinstance(options.labels, str) else options.labels
     if not candidates:
@@ -63,7 +63,7 @@ def compare(
     if options.replicate is not None:
         files = find_trajectories(options.replicate)
         replicate = load_ensemble(files, template=ref.scene, top=tops[-1], lag_ps=lags[-1])
-    result = evaluate(ref, others, replicate, ref.scene)
+    result = evaluate(ref, others, replicate)
     if out_html is not None:
         from surrogate.comparison.report.report import write_report
 

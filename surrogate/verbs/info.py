@@ -66,10 +66,11 @@ def _coverage(path: Path, scene: str) -> dict[str, Any]:
         match = match_domain(prepared, weights, force=True)
     except OutOfDomainError as error:
         return {"scene": prepared.name, "covered": "no", "reason": str(error)}
+    unseen = "never saw this molecule" + (f"; {match.nearness}" if match.nearness else "")
     return {
         "scene": prepared.name,
         "covered": "only with force" if match.deviations else "yes",
-        "training": "trained on this molecule" if match.seen else f"never saw this molecule; {match.nearness}",
+        "training": "trained on this molecule" if match.seen else unseen,
         **({"reason": "; ".join(f"{d.what}: {d.reason}" for d in match.deviations)} if match.deviations else {}),
     }
 

@@ -62,8 +62,10 @@ def _written(settings: dict[str, Any]) -> dict[str, Any]:
 def prepare_scene(scene: str | Path | Scene, options: Preparation, *, quiet: bool) -> Scene:
     """Return a Scene for what a user may write, a path as such too; what had to be repaired is said on stderr. Raises
     what `systems.library.named_scenes.prepare` raises."""
-    if not isinstance(scene, str | Path):
+    if isinstance(scene, Scene):
         return scene
+    if not isinstance(scene, str | Path):
+        raise InputError(f"a scene is a file, a name, smiles:…, sequence:… or a Scene, not a {type(scene).__name__}.")
     scene = str(scene)
     prepared = named_scenes.prepare(scene, options=part_of(options, Preparation))
     for line in prepared.provenance.get("repairs", []):
@@ -116,6 +118,10 @@ def find_trajectories(spec: Trajectories, *, verify: bool = False) -> list[Path]
     the runs that its manifest calls complete, whose hashes are checked if `verify`. Raises InputError when nothing is
     found, TrajectoryError when a hash differs.
     """
+    if not isinstance(spec, (str, Path, Sequence)):
+        raise InputError(
+            f"a trajectory is a file, a folder, a pattern or a list of these, not a {type(spec).__name__}."
+        )
     if not isinstance(spec, (str, Path)):
         return [path for part in spec for path in find_trajectories(part, verify=verify)]
     path = Path(spec)

@@ -120,6 +120,7 @@ def resolve_run(
     options those count that are settings of a run (MDConfig, ForceFieldSpec) or make its box. Raises InputError."""
     from md_reference.forces.forcefield import resolve
     from md_reference.forces.solvation import require_molecules, solvate_if_asked
+    from md_reference.run.plan import warnings_of
 
     given = asdict(options) | {"force_field": at_level(options.level, options.force_field)}
     settings_of_a_run = {f.name for kind in (MDConfig, ForceFieldSpec) for f in fields(kind)} - {"hydrogen_mass_da"}
@@ -142,7 +143,7 @@ def resolve_run(
     config = resolved(scene, config)
     if scene is not dry:
         tell(scene.name, scene.provenance["repairs"][-1], quiet=quiet)
-    for warning in config.force.warnings:
+    for warning in warnings_of(scene, config):
         tell(scene.name, f"warning: {warning}", quiet=quiet)
     return scene, config, protocol
 
@@ -246,7 +247,7 @@ def campaign(file: PathLike, out: PathLike | None = None, *, options: CampaignOp
             raise
         # While workers start or end.
         summary = describe_campaign(asked.folder)["summary"]
-        raise KeyboardInterrupt(f"{asked.folder}: {summary}; the same command goes on") from None
+        raise KeyboardInterrupt(f"{asked.folder}: {summary}; run the same command to continue") from None
     return describe_campaign(asked.folder)
 
 

@@ -215,7 +215,7 @@ def _solve(
 # ---- of a whole structure -------------------------------------------------------------------------------------------
 
 
-_VALENCE = {"H": 1, "B": 3, "C": 4, "N": 3, "O": 2, "F": 1, "Si": 4, "P": 3, "S": 2, "Cl": 1, "Se": 2, "Br": 1, "I": 1}
+VALENCE = {"H": 1, "B": 3, "C": 4, "N": 3, "O": 2, "F": 1, "Si": 4, "P": 3, "S": 2, "Cl": 1, "Se": 2, "Br": 1, "I": 1}
 _IONS = {"Li": 1, "Na": 1, "K": 1, "Rb": 1, "Cs": 1, "Mg": 2, "Ca": 2, "Sr": 2, "Ba": 2, "Zn": 2, "F": -1, "Cl": -1,
          "Br": -1, "I": -1, "Cu": 2, "Fe": 2, "Mn": 2, "Co": 2, "Ni": 2, "Cd": 2}  # fmt: skip
 
@@ -239,6 +239,7 @@ def perceive(
     bonds: npt.NDArray[np.int64],
     positions_nm: npt.NDArray[np.float64] | None = None,
     trusted: Collection[int] = (),
+    ions: Mapping[int, int] | None = None,
 ) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.int64]]:
     """Return bond orders `(n_bonds,)` and formal charges `(n_atoms,)` of one Kekulé structure.
 
@@ -246,13 +247,14 @@ def perceive(
     stays open is an anion on O and S, a cation on a nitrogen beside an open carbon. A molecule that this leaves with an
     atom in no usual state is given the Lewis structure of least penalty. With `positions_nm` `(n_atoms, 3)`, carbons
     that are unsaturated in such a structure, beside a charge or in C=C must be flat or straight, unless they are
-    `trusted` to have all hydrogens. Raises ValenceError naming the atoms that fit nothing.
+    `trusted` to have all hydrogens. Lone atoms have the charges of `ions`, else their element's usual one. Raises
+    ValenceError naming the atoms that fit nothing.
     """
     neighbours: list[list[int]] = [[] for _ in elements]
     for i, j in bonds.tolist():
         neighbours[i].append(j)
         neighbours[j].append(i)
-    found = _Kekule(elements, bonds, neighbours, positions_nm)
+    found = _Kekule(elements, bonds, neighbours, positions_nm, ions or {})
     orders, charges, bad = found.orders, found.charges, found.bad
     valence = np.zeros(len(elements))
     np.add.at(valence, bonds.ravel(), np.repeat(orders, 2))
@@ -340,8 +342,10 @@ class _Kekule:
         bonds: npt.NDArray[np.int64],
         neighbours: list[list[int]],
         positions_nm: npt.NDArray[np.float64] | None,
+        ions: Mapping[int, int],
     ) -> None:
         self._elements, self._neighbours, self._positions_nm = elements, neighbours, positions_nm
+        self._ions = ions
         self.charges = np.zeros(len(elements), dtype=np.int64)
         self.order = {(min(i, j), max(i, j)): 1 for i, j in bonds.tolist()}
         self._open = [self._open_valence(i) for i in range(len(elements))]
@@ -358,10 +362,10 @@ class _Kekule:
 
     def _open_valence(self, i: int) -> int:
         symbol, degree = self._elements[i], len(self._neighbours[i])
-        if degree == 0 and symbol in _IONS:
-            self.charges[i] = _IONS[symbol]
+        if degree == 0 and (i in self._ions or symbol in _IONS):
+            self.charges[i] = self._ions.get(i, _IONS.get(symbol, 0))
             return 0
-        if symbol not in _VALENCE:
+        if symbol not in VALENCE:
             return -1
         if symbol in ("P", "S", "Se") and degree >= 3:
             return 0
@@ -371,7 +375,7 @@ class _Kekule:
         if symbol == "B" and degree == 4:
             self.charges[i] = -1
             return 0
-        return _VALENCE[symbol] - degree
+        return VALENCE[symbol] - degree
 
     def _oxidise(self) -> None:
         """Nitro groups and the oxides of P and S, whose centres have no open valence of their own."""

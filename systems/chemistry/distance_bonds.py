@@ -119,7 +119,7 @@ def refuse_long_bonds(
     if wrong:
         k = int(excess.argmax())
         i, j = rows[k].tolist()
-        more = f" ({wrong - 1} more are too long)" if wrong > 1 else ""
+        more = f" ({wrong - 1} more too long)" if wrong > 1 else ""
         raise PreparationError(
             f"the bond {label(i)} - {label(j)} is {10 * length[k]:.2f} Å long{more}: the molecule is broken; make it "
             "whole (unwrap it from its periodic cell, or write the cell into the file), or correct the coordinates."

@@ -100,8 +100,10 @@ def element_symbol(name_field: str, residue_name: str, written: str, *, hetero: 
     residue = residue_name.upper()
     two = letters[:2].capitalize()
     # The columns of PDB files put an element's second letter where a nitrogen called NA has its first.
-    halogen = two in ("Cl", "Br") and (len(letters) == 2 or letters[2:].isdigit())
+    numbered = len(letters) == 2 or letters[2:].isdigit()
+    halogen = two in ("Cl", "Br") and numbered
     other = (hetero or residue in _UNNAMED_RESIDUES) and not name_field.startswith(" ")
+    other = other and (numbered or two != "Na")  # nitrogens are called NAA, NAB, ... where letters count
     if (halogen or other) and two in _TWO_LETTER_IN_LIGANDS and template_for(residue) is None:
         return two
     if residue in ("MSE", "SEC") and two == "Se":

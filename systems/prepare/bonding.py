@@ -19,7 +19,7 @@ from systems.chemistry.residues import (
     known_template,
     template_for,
 )
-from systems.errors import PreparationError, listed
+from systems.errors import PreparationError, counted, listed
 from systems.prepare.records import AtomRecord, Bonding, Residue, by_residue
 from systems.scene import IntArray, neighbours_of
 
@@ -67,7 +67,7 @@ def find_bonds(atoms: Sequence[AtomRecord], conect: Sequence[tuple[int, int]]) -
             raise PreparationError(f"Hydrogen {atoms[i].label} is {away}; correct or remove it.")
     if strays:
         gone = listed([atoms[i].label for i in strays])
-        found.notes.append(f"hydrogens left out whose atoms are missing: {gone}")
+        found.notes.append(f"hydrogens removed because their heavy atoms are missing: {gone}")
     found.notes += [
         f"disulfide bond {of_atom[i].label} - {of_atom[j].label} ({10 * float(np.linalg.norm(x[i] - x[j])):.2f} Å)"
         for i, j in bonds.tolist()
@@ -134,7 +134,7 @@ class _Bonds:
         for i, j, d in self.near:
             if d < _COINCIDENT_NM:
                 raise PreparationError(
-                    f"{atoms[i].label} and {atoms[j].label} stand on one point ({d * 10:.2f} Å apart); "
+                    f"{atoms[i].label} and {atoms[j].label} have the same coordinates ({d * 10:.2f} Å apart); "
                     "remove one of them."
                 )
         self.residues = _residues(atoms)
@@ -161,7 +161,8 @@ class _Bonds:
             if d >= _PEPTIDE_NM or self.of_atom[i] is self.of_atom[j]:
                 continue
             for c, n in ((i, j), (j, i)):
-                is_carbonyl = self.of_atom[c].heavy.get("C") == c and "O" in self.of_atom[c].heavy
+                residue = self.of_atom[c]  # whose O may be missing from the file
+                is_carbonyl = residue.heavy.get("C") == c and residue.template and "O" in residue.template.heavy
                 if is_carbonyl and self.of_atom[n].heavy.get("N") == n and d < best.get(c, (1.0, 0))[0]:
                     best[c] = (d, n)
         return {(c, n) for c, (_, n) in best.items()}
@@ -182,7 +183,7 @@ class _Bonds:
                 broken.append((i, j))
         self.refuse_long(broken)
         if n_to_metals:
-            self.notes.append(f"{n_to_metals} CONECT bonds to metal ions are ignored: ions coordinate")
+            self.notes.append(f"{counted(n_to_metals, 'CONECT bond')} to metal ions ignored: ions coordinate")
 
     def free_atoms(self) -> set[int]:
         """Atoms whose bonds must come from distances."""

@@ -12,7 +12,7 @@ import numpy as np
 
 from systems.chemistry.distance_bonds import bonded_images, images_of_whole
 from systems.chemistry.geometry import extend, near_pairs, signed_volumes
-from systems.errors import PreparationError, listed
+from systems.errors import PreparationError, counted, listed
 from systems.prepare.bonding import links_residues
 from systems.prepare.records import AtomRecord, Bonding, Residue, StructureFile, distance_angstrom
 from systems.scene import FloatArray, IntArray, neighbours_of
@@ -46,7 +46,7 @@ def close_gaps(structure: StructureFile, bonding: Bonding, *, cap_breaks: bool, 
     for before, residue in gaps:
         if not cap_breaks:
             gap = np.linalg.norm(_at(atoms, before, "C") - _at(atoms, residue, "N"))
-            more = f", and in {len(gaps) - 1} more places" if len(gaps) > 1 else ""
+            more = f", and in {counted(len(gaps) - 1, 'more place')}" if len(gaps) > 1 else ""
             raise PreparationError(
                 f"the chain breaks between {before.label} and {residue.label} (C and N are {gap:.1f} Å apart){more}; "
                 "fill the gap, add `cap_breaks=True` to close both ends with caps, or end the chain there with a TER "
@@ -240,11 +240,11 @@ def check_contacts(atoms: Sequence[AtomRecord], bonds: IntArray) -> list[str]:
     if not found:
         return []
     gap, i, j = min(found)
-    more = f", and {len(found) - 1} pairs more are close" if len(found) > 1 else ""
+    more = f" ({counted(len(found) - 1, 'more close pair')})" if len(found) > 1 else ""
     what = f"{atoms[i].label} and {atoms[j].label} are {gap:.2f} Å apart and not bonded{more}"
     if gap < _COINCIDE_ANGSTROM:
         raise PreparationError(f"{what}: atoms have the same place; take one of them out, or model them again.")
-    return [f"{what}; minimising has to part them"]
+    return [f"{what}; energy minimisation must separate them"]
 
 
 def _is_near(neighbours: list[list[int]], i: int, j: int) -> bool:

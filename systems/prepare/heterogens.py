@@ -10,7 +10,7 @@ import networkx as nx
 import numpy as np
 
 from systems.chemistry.residues import NAMES, is_water_name, template_for
-from systems.errors import PreparationError, listed
+from systems.errors import PreparationError, counted, listed
 from systems.prepare.bonding import are_ions
 from systems.prepare.records import AtomRecord, Bonding, by_residue
 from systems.scene import FloatArray, IntArray
@@ -52,7 +52,7 @@ def complete_waters(
         ]
         around = np.concatenate([around, pair])
     n = len(oxygens)
-    notes.append(f"{_counted(n, 'water molecule')} kept" + (f", hydrogens placed on {len(bare)}" if bare else ""))
+    notes.append(f"{counted(n, 'water molecule')} kept" + (f", hydrogens placed on {len(bare)}" if bare else ""))
     records = [a for oxygen, hydrogens in zip(oxygens, own, strict=True) for a in (oxygen, *hydrogens)]
     first = 3 * np.arange(n)
     bonds = np.stack([np.stack([first, first + k], axis=1) for k in (1, 2)], axis=1).reshape(-1, 2)
@@ -107,17 +107,13 @@ def resolve_solvent(
     count = Counter(atoms[i].residue_name for i in kept if i in free)
     names = listed([f"{n} {name}" if n > 1 else name for name, n in count.items()])
     gone = [
-        *([_counted(n_waters, "water molecule")] if n_waters and not keep_water else []),
-        *([f"{_counted(len(cut), 'hydrogen')} of waters without oxygen"] if cut else []),
+        *([counted(n_waters, "water molecule")] if n_waters and not keep_water else []),
+        *([f"{counted(len(cut), 'hydrogen')} of waters without oxygen"] if cut else []),
         *([f"free ion{'s' if len(free) > 1 else ''} {names}"] if free else []),
     ]
     if gone:
         notes.append(f"{' and '.join(gone)} left out")
     return [i for i in kept if i not in wet and i not in free], sorted(wet - cut) if keep_water else []
-
-
-def _counted(n: int, what: str) -> str:
-    return f"{n} {what}{'s' if n > 1 else ''}"
 
 
 def _free(atoms: Sequence[AtomRecord], ions: Sequence[int], solute: Sequence[int]) -> set[int]:

@@ -175,7 +175,7 @@ def _perceived(
         why = (
             f"{listed([found.atoms[part[k]].name for k in bent])} lack hydrogens"
             if bent
-            else "its bonds fit no valence"
+            else "it has no valid Lewis structure"
         )
         raise PreparationError(f"{why}; give the molecule with all hydrogens, or as SDF.")
     return [round(order) for order in solved[0].tolist()], [int(q) for q in solved[1].tolist()]

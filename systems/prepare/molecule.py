@@ -103,6 +103,11 @@ def scene_from_component(text: str, path: Path) -> Scene:
             atom.SetNoImplicit(True)
             index[each.id] = molecule.AddAtom(atom)
         for bond in component.rt.bonds:
+            if bond.type.name.upper() not in Chem.BondType.names:
+                raise InputError(
+                    f"{path}, component {block.name}: it has bonds of type {bond.type.name.lower()!r}, which do not "
+                    "fix a Lewis structure; give the wwPDB's CIF or an SDF."
+                )
             order = Chem.BondType.names[bond.type.name.upper()]
             molecule.AddBond(index[bond.id1.atom], index[bond.id2.atom], order)
             for i in (index[bond.id1.atom], index[bond.id2.atom]) if order == Chem.BondType.AROMATIC else ():
@@ -186,14 +191,14 @@ def _with_geometry(molecule: Any, notes: list[str]) -> Any:
     if out.GetNumAtoms() > molecule.GetNumAtoms():
         notes.append(f"hydrogens added: {out.GetNumAtoms() - molecule.GetNumAtoms()}")
     if is_drawing:
-        notes.append("a flat drawing: 3-D coordinates embedded, stereo from its wedges")
+        notes.append("2-D structure: 3-D coordinates generated, stereochemistry from the wedge bonds")
         return embed(out, seed=0, notes=notes)
     symbols, positions = [atom.GetSymbol() for atom in out.GetAtoms()], np.array(out.GetConformer().GetPositions())
     if not np.isfinite(positions).all():
         raise PreparationError("a coordinate is not a number; write the file again.")
     for i, j in near_pairs(positions, 0.3, "the molecule").tolist():
         raise PreparationError(
-            f"atoms {i + 1} ({symbols[i]}) and {j + 1} ({symbols[j]}) stand on one point; correct the coordinates."
+            f"atoms {i + 1} ({symbols[i]}) and {j + 1} ({symbols[j]}) have the same coordinates; correct them."
         )
     bonds = np.array([(b.GetBeginAtomIdx(), b.GetEndAtomIdx()) for b in out.GetBonds()], dtype=np.int64)
     refuse_long_bonds(symbols, positions / 10.0, bonds, lambda i: f"{symbols[i]}{i + 1}")
@@ -302,17 +307,25 @@ def parse_smiles(text: str, notes: list[str]) -> Any:
 
 
 def require(molecule: Any) -> None:
-    """Raise PreparationError for wildcards, metals and other elements without a model, and giants."""
+    """Raise PreparationError for wildcards, bonds without an order, metals and other elements without a model, and
+    giants."""
     symbols = sorted({a.GetSymbol() for a in molecule.GetAtoms()})
     if not symbols:
         raise PreparationError("it has no atoms.")
     if "*" in symbols or any(a.HasQuery() for a in molecule.GetAtoms()):
         raise PreparationError("it holds wildcard atoms (*); write the elements.")
+    for bond in molecule.GetBonds():
+        if bond.HasQuery() or bond.GetBondTypeAsDouble() == 0:
+            ends = (f"{a.GetSymbol()}{a.GetIdx() + 1}" for a in (bond.GetBeginAtom(), bond.GetEndAtom()))
+            raise PreparationError(
+                f"the bond {' - '.join(ends)} has no order (a query, or of type 0); write it as single, double, triple "
+                "or aromatic."
+            )
     foreign = [s for s in symbols if s not in _ELEMENTS]
     if foreign:
         raise PreparationError(
             f"it holds {', '.join(foreign)}: metals and rare elements have no parameters and no reliable 3-D "
-            f"embedding; molecules are prepared of {', '.join(_ELEMENTS)}."
+            f"embedding; supported elements: {', '.join(_ELEMENTS)}."
         )
     if molecule.GetNumAtoms() > _LARGEST:
         raise PreparationError(f"it has {molecule.GetNumAtoms()} atoms; molecules are embedded up to {_LARGEST}.")
@@ -403,7 +416,11 @@ def compare_stereo(before: Any, after: Any) -> list[str]:
                 f"{_where(before, where)} is {label} in the input and {has.get(where, 'flat')} in 3-D; "
                 "its stereo may be impossible. Give an SDF with coordinates."
             )
-    return [f"{_where(before, k)} is not specified: drawn as {label}" for k, label in has.items() if k not in had]
+    return [
+        f"{_where(before, k)} is not specified in the input; {label} was chosen"
+        for k, label in has.items()
+        if k not in had
+    ]
 
 
 def _where(molecule: Any, where: tuple[int, ...]) -> str:
@@ -423,7 +440,7 @@ def sanitise(molecule: Any) -> None:
         with rdBase.BlockLogs():
             Chem.SanitizeMol(molecule)
     except (Chem.MolSanitizeException, ValueError) as error:
-        raise PreparationError(f"it is no possible molecule: {first_line(error)} (a charge left out?).") from error
+        raise PreparationError(f"RDKit rejects it: {first_line(error)} (is a formal charge missing?).") from error
 
 
 def drop_isotopes(molecule: Any, notes: list[str]) -> None:

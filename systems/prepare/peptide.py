@@ -58,6 +58,10 @@ def build_peptide(text: str, *, ph: float = 7.0) -> Scene:
     from openmm import Platform, app, unit
 
     names = parse_sequence(text)
+    if len(names) == 1:
+        raise PreparationError(
+            f"Sequence {text!r} is a single amino acid; cap it (ACE-{names[0]}-NME), or give it as smiles:…"
+        )
     topology, positions_nm = _heavy_atoms(names)
     variants = [name if name in _PROTONATED else None for name in names]
     reference = Platform.getPlatformByName("Reference")
@@ -69,6 +73,8 @@ def build_peptide(text: str, *, ph: float = 7.0) -> Scene:
     records, bonds = records_from_openmm(modeller.topology, relaxed_nm, keys)
     labels = [f"{name} {number}" for _, number, name in keys]
     summary = protonation_summary(labels, keys, variants, records, ph)
+    if any(letter.islower() for letter in text):
+        summary.append("lower-case letters read as L-residues")
     return scene_from_records(
         records,
         bonds,

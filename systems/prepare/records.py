@@ -13,9 +13,9 @@ from typing import Any
 
 import numpy as np
 
-from systems.chemistry.bond_orders import ValenceError, perceive
-from systems.chemistry.element_data import atomic_weight_da
-from systems.chemistry.residues import ResidueTemplate, component, template_for
+from systems.chemistry.bond_orders import VALENCE, ValenceError, perceive
+from systems.chemistry.element_data import atomic_weight_da, is_lone_ion
+from systems.chemistry.residues import NAMES, ResidueTemplate, component, template_for
 from systems.errors import InputError, PreparationError, listed
 from systems.files.outside import content
 from systems.scene import FloatArray, IntArray, Scene, neighbours_of
@@ -35,7 +35,10 @@ def suffix_of(path: Path) -> str:
 def read_text(path: Path, wanted: str) -> str:
     """Return the text of a file. Raises InputError, which asks for what is `wanted`, where it holds none."""
     if not path.exists():
-        raise InputError(f"{path} does not exist; check the path, or name a library system (`surromd systems`).")
+        raise InputError(
+            f"{path} does not exist; check the path, or name a library system (`surromd systems`); a molecule is given "
+            "as smiles:..., a peptide as sequence:..."
+        )
     try:
         data = content(path)
     except (OSError, ValueError) as error:
@@ -57,7 +60,8 @@ def file_name_and_provenance(path: Path, repairs: list[str], **more: Any) -> dic
 
 @dataclass(frozen=True)
 class AtomRecord:
-    """One ATOM or HETATM record; positions in Å as the file has them."""
+    """One ATOM or HETATM record; positions in Å as the file has them. `charge`: the formal charge that the file states
+    of the atom, None where it states none or 0."""
 
     name: str
     element: str
@@ -68,7 +72,7 @@ class AtomRecord:
     serial: str = ""
     altloc: str = ""
     occupancy: float = 1.0
-    hetero: bool = False
+    charge: int | None = None
 
     @property
     def residue_key(self) -> ResidueKey:
@@ -180,7 +184,7 @@ def standardise(atoms: Sequence[AtomRecord], notes: list[str]) -> list[AtomRecor
         if atom.residue_name.upper() == "MSE":
             changed.append(f"{atom.chain}{atom.residue_id}")
             name, element = ("SD", "S") if atom.element == "Se" else (atom.name, atom.element)
-            out[i] = replace(atom, residue_name="MET", hetero=False, name=name, element=element)
+            out[i] = replace(atom, residue_name="MET", name=name, element=element)
     if changed:
         notes.append(f"selenomethionine made methionine (SE to SD): {listed(list(dict.fromkeys(changed)))}")
     for (chain, number, name), members in by_residue(out).items():
@@ -213,14 +217,20 @@ def scene_from_records(atoms: Sequence[AtomRecord], bonds: IntArray, *, name: st
     positions_nm = np.array([a.position_angstrom for a in atoms], dtype=np.float64).reshape(-1, 3) / 10.0
     try:
         known = [i for i, a in enumerate(atoms) if _is_known(a)]
-        orders, charges = perceive(elements, bonds, positions_nm, trusted=known)
+        orders, charges = perceive(elements, bonds, positions_nm, trusted=known, ions=_ion_charges(atoms, bonds))
     except ValenceError as error:
+        first = atoms[error.atoms[0]]
+        if first.element not in VALENCE and error.atoms[0] not in bonds:
+            raise PreparationError(
+                f"no charge is known for the lone atom {first.label}; state it in columns 79-80 of its record (mmCIF: "
+                "pdbx_formal_charge), or leave it out with `drop_ligand=True`."
+            ) from error
         raise PreparationError(
-            f"the bonds of {listed([atoms[i].label for i in error.atoms], 4)} fit no valence; give the structure with "
+            f"no valid Lewis structure for {listed([atoms[i].label for i in error.atoms], 4)}; give the structure with "
             "all hydrogens, and with CONECT records if its geometry is unusual."
         ) from error
-    if "repairs" in provenance and (said := _perceived_charges(atoms, bonds, charges)):
-        provenance = provenance | {"repairs": [*provenance["repairs"], said]}
+    if "repairs" in provenance:
+        provenance = provenance | {"repairs": [*provenance["repairs"], *_charge_notes(atoms, bonds, charges)]}
     keys: list[ResidueKey] = []
     residue_of_atom = []
     for atom in atoms:
@@ -244,16 +254,34 @@ def scene_from_records(atoms: Sequence[AtomRecord], bonds: IntArray, *, name: st
     )
 
 
-def _perceived_charges(atoms: Sequence[AtomRecord], bonds: IntArray, charges: IntArray) -> str:
-    """A line about charges that follow from bonds alone: of atoms of unknown residues, and of thiolates not named so;
-    monatomic ions are theirs by name."""
+def _ion_charges(atoms: Sequence[AtomRecord], bonds: IntArray) -> dict[int, int]:
+    """The charges of monatomic ions that the file states, or that their names do."""
     bonded = set(bonds.ravel().tolist())
-    found = [
-        f"{atom.label} {q:+d}"
-        for i, (atom, q) in enumerate(zip(atoms, charges.tolist(), strict=True))
-        if q and i in bonded and (not _is_known(atom) or (atom.element == "S" and atom.residue_name != "CYM"))
-    ]
-    return f"charges that no file states, by bonds and hydrogens: {listed(found)}" if found else ""
+    lone = {i: a for i, a in enumerate(atoms) if i not in bonded and is_lone_ion(a.element)}
+    found = {i: a.charge or NAMES["ion_charges"].get(a.residue_name.upper()) for i, a in lone.items()}
+    return {i: q for i, q in found.items() if q}
+
+
+def _charge_notes(atoms: Sequence[AtomRecord], bonds: IntArray, charges: IntArray) -> list[str]:
+    """Lines about charges that follow from bonds alone: of atoms of unknown residues, and of thiolates not named so;
+    and of unknown residues whose atoms the file gives another sum of charges (of a standard one some files state the
+    side chain's alone). Monatomic ions are theirs by name."""
+    bonded = set(bonds.ravel().tolist())
+    found, other = [], []
+    for (chain, number, name), members in by_residue(atoms).items():
+        stated, total = sum(atoms[i].charge or 0 for i in members), int(charges[members].sum())
+        if any(atoms[i].charge for i in members):
+            if stated != total and not _is_known(atoms[members[0]]):
+                other.append(f"{name} {chain}{number} ({stated:+d} stated, {total:+d} used)")
+            continue
+        found += [
+            f"{atoms[i].label} {charges[i]:+d}"
+            for i in members
+            if charges[i] and i in bonded and (not _is_known(atoms[i]) or (atoms[i].element == "S" and name != "CYM"))
+        ]
+    lines = (("charges that no file states, by bonds and hydrogens", found),
+             ("charges stated in the file but not used, as bonds and hydrogens give others", other))  # fmt: skip
+    return [f"{line}: {listed(of)}" for line, of in lines if of]
 
 
 def _is_known(atom: AtomRecord) -> bool:

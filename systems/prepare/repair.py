@@ -7,7 +7,7 @@ from __future__ import annotations
 import contextlib
 import io
 import random
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import lru_cache
 from importlib.resources import files
@@ -30,17 +30,20 @@ from systems.scene import FloatArray, IntArray, neighbours_of
 _C_OXT_ANGSTROM = 1.25
 _HYDROGEN_ANGSTROM = {"C": 1.09, "N": 1.01, "O": 0.96, "S": 1.34}
 _UNKNOWN = "XCC"
+# Coordinates below -999.999 Å do not fit the columns of a PDB file.
+_COLUMNS_ANGSTROM = 900.0
 _CHAIN_LETTERS = "ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz0123456789"
 
 
 def complete(
-    atoms: Sequence[AtomRecord], bonding: Bonding, *, ph: float
+    atoms: Sequence[AtomRecord], bonding: Bonding, *, ph: float, metals: Sequence[AtomRecord] = ()
 ) -> tuple[list[AtomRecord], IntArray, list[str]]:
     """Return atoms, bonds and a summary of what was added to structures of residues that are all known by name.
 
     Heavy atoms of the file keep their positions; hydrogens of residues that had all of theirs keep them too, the others
-    get new ones, in the protonation that the file shows or, where it shows none, the usual one at `ph`. Names become
-    the standard ones, residues stand in chain order. Raises PreparationError when PDBFixer cannot complete the
+    get new ones, in the protonation that the file shows or, where it shows none, the one that `metals` which stay
+    beside the structure leave, else the usual one at `ph`. Names become the standard ones, residues stand in chain
+    order. Raises PreparationError when PDBFixer cannot complete the
     structure.
     """
     from openmm import Platform, app, unit
@@ -48,7 +51,9 @@ def complete(
 
     chains = _chains(bonding)
     residues = [r for chain in chains for r in chain]
-    text = _heavy_atom_text(atoms, chains)
+    lowest = np.min([a.position_angstrom for a in atoms], axis=0)
+    shift = np.where(lowest < -_COLUMNS_ANGSTROM, np.floor(lowest), 0.0)
+    text = _heavy_atom_text([_moved(a, -shift) for a in atoms] if shift.any() else atoms, chains)
     neighbours = bonding.neighbours
     closed = {
         end.key
@@ -56,8 +61,10 @@ def complete(
         for end in (chain[0], chain[-1])
         if (chain[-1].heavy.get("C", -1), chain[0].heavy.get("N", -1)) in bonding.peptide_bonds
     }
+    holding = [_metals_of(residue, atoms, metals) for residue in residues]
     variants = [
-        asked_hydrogens(residue, atoms, neighbours, ph=ph, in_cycle=residue.key in closed) for residue in residues
+        asked_hydrogens(residue, atoms, neighbours, ph=ph, in_cycle=residue.key in closed, holding=held)
+        for residue, held in zip(residues, holding, strict=True)
     ]
     reference = Platform.getPlatformByName("Reference")
     try:
@@ -75,12 +82,16 @@ def complete(
         raise
     except Exception as error:  # PDBFixer and OpenMM raise bare Exceptions, KeyErrors and ValueErrors alike
         raise PreparationError(f"PDBFixer could not complete the structure ({first_line(error)}).") from error
-    positions_nm = np.array(modeller.positions.value_in_unit(unit.nanometer), dtype=np.float64)
+    positions_nm = np.array(modeller.positions.value_in_unit(unit.nanometer), dtype=np.float64) + shift / 10.0
     records, bonds = records_from_openmm(modeller.topology, positions_nm, [r.key for r in residues])
     names = {(r.key, a) for r in residues for a in r.heavy}
     records = _with_usual_lengths(records, bonds, names)
     records = _keep_hydrogens(records, bonds, atoms, bonding)
     summary = _summary(residues, records, ph) + rebuilt
+    for residue, variant, held in zip(residues, variants, holding, strict=True):
+        if held and variant != variant_of(residue, atoms, neighbours) and isinstance(variant, str):
+            bound, what = _BY_METAL[variant]
+            summary.append(f"{residue.label}: {what}, because {bound} binds {held[bound]}")
     summary += protonation_summary([r.label for r in residues], [r.key for r in residues], variants, records, ph)
     if [a.name for a in records if a.element != "H"] != [a.name for a in atoms if a.element != "H"]:
         summary.append("atoms stand in the standard order under their standard names")
@@ -180,6 +191,11 @@ def _chains(bonding: Bonding) -> list[list[Residue]]:
         if chain:
             chains.append(chain)
     return chains
+
+
+def _moved(atom: AtomRecord, by_angstrom: FloatArray) -> AtomRecord:
+    x, y, z = (np.array(atom.position_angstrom) + by_angstrom).tolist()
+    return replace(atom, position_angstrom=(x, y, z))
 
 
 def _heavy_atom_text(atoms: Sequence[AtomRecord], chains: Sequence[Sequence[Residue]]) -> str:
@@ -285,8 +301,7 @@ def _summary(residues: Sequence[Residue], records: Sequence[AtomRecord], ph: flo
     by_dictionary = [label for key, label in short.items() if template_for(key[2]) is None]
     if by_dictionary:
         notes.append(
-            f"their hydrogens by the chemical component dictionary, groups charged as at pH {ph:g}: "
-            f"{listed(by_dictionary)}"
+            f"hydrogens added from the Chemical Component Dictionary, ionised as at pH {ph:g}: {listed(by_dictionary)}"
         )
     if short:
         n = sum(a.element == "H" and a.residue_key in short for a in records)
@@ -308,16 +323,30 @@ _STATES = {
 }  # fmt: skip
 # A variant of Modeller's by name, the hydrogens one by one with their heavy atoms, or None: what pH decides.
 Asked = str | list[tuple[str, str]] | None
+# What other programs say of the protonation by a residue's name.
+_SAYS = {"HSD": "HID", "HISD": "HID", "HISA": "HID", "HSE": "HIE", "HISE": "HIE", "HISB": "HIE", "HSP": "HIP",
+         "HISH": "HIP", "ASPP": "ASH", "ASPH": "ASH", "GLUP": "GLH", "GLUH": "GLH", "LSN": "LYN"}  # fmt: skip
+# Farther than this from a metal an atom keeps its proton: bonds of metals to N and S are 1.9 to 2.6 Å long.
+_COORDINATED_ANGSTROM = 2.8
+# Of the variants that a metal leaves: the atom that binds it, and what becomes of the proton.
+_BY_METAL = {"HIE": ("ND1", "proton placed on NE2"), "HID": ("NE2", "proton placed on ND1"), "CYX": ("SG", "thiolate")}
 # Hydrogens that Modeller's own rules count rightly: peptide bonds, and sulfurs in disulfides.
 _USUAL_LINKS = {"N": 1, "C": 1, "SG": 1}
 
 
 def asked_hydrogens(
-    residue: Residue, atoms: Sequence[AtomRecord], neighbours: Sequence[Sequence[int]], *, ph: float, in_cycle: bool
+    residue: Residue,
+    atoms: Sequence[AtomRecord],
+    neighbours: Sequence[Sequence[int]],
+    *,
+    ph: float,
+    in_cycle: bool,
+    holding: Collection[str] = (),
 ) -> Asked:
     """Return what to ask of Modeller for a residue.
 
-    Standard residues are left to its rules, in the protonation that the file shows. Components of the dictionary, and
+    Standard residues are left to its rules, in the protonation that the file shows, or that metals leave, which the
+    atoms called `holding` bind. Components of the dictionary, and
     standard residues where those rules fail (an end of the chain that a bond closes, a side chain bonded to another
     residue), are asked for hydrogen by hydrogen: those of the file where it has all, else the dictionary's at this pH.
     Raises PreparationError for a residue of which nothing is known.
@@ -326,7 +355,7 @@ def asked_hydrogens(
     links = links_of(residue, neighbours)
     is_standard = template_for(residue.key[2]) is not None
     if is_standard and not in_cycle and all(n <= _USUAL_LINKS.get(atom, 0) for atom, n in links.items()):
-        return variant_of(residue, atoms, neighbours)
+        return variant_of(residue, atoms, neighbours, holding)
     if not residue.lacks_hydrogens:
         return [
             (atoms[h].name, name) for name, i in residue.heavy.items() for h in neighbours[i] if atoms[h].element == "H"
@@ -337,12 +366,18 @@ def asked_hydrogens(
     return hydrogens_of(found, {*residue.heavy, *residue.missing}, links, ph=ph)
 
 
-def variant_of(residue: Residue, atoms: Sequence[AtomRecord], neighbours: Sequence[Sequence[int]]) -> str | None:
-    """Return Modeller's name of the protonation that the residue's own hydrogens or name show, or None."""
+def variant_of(
+    residue: Residue, atoms: Sequence[AtomRecord], neighbours: Sequence[Sequence[int]], holding: Collection[str] = ()
+) -> str | None:
+    """Return Modeller's name of the protonation that the residue's own hydrogens or name show, or a metal which the
+    atoms called `holding` bind, or None."""
     name = residue.key[2].upper()
-    named = {"HSD": "HID", "HSE": "HIE", "HSP": "HIP", "ASPP": "ASH", "GLUP": "GLH", "LSN": "LYN"}.get(name, name)
-    if named in ("CYX", "CYS2"):  # without its partner it is a cysteine like any other
-        return "CYX" if "SG" in links_of(residue, neighbours) else None
+    if len(name) == 4 and name[0] in "NC" and template_for(name[1:]) is not None:  # Amber's terminal forms
+        name = name[1:]
+    named = _SAYS.get(name, name)
+    if named in ("CYX", "CYS2", "CYS"):  # without its partner it is a cysteine like any other
+        is_thiolate = "SG" in holding and residue.lacks_hydrogens
+        return "CYX" if is_thiolate or "SG" in links_of(residue, neighbours) else None
     if named in ("HID", "HIE", "HIP", "ASH", "GLH", "LYN"):
         return named
     if named == "CYM":
@@ -352,13 +387,25 @@ def variant_of(residue: Residue, atoms: Sequence[AtomRecord], neighbours: Sequen
         return None
     count = {a: sum(atoms[j].element == "H" for j in neighbours[i]) for a, i in residue.heavy.items()}
     if template.name == "HIS":
-        return {(1, 1): "HIP", (1, 0): "HID", (0, 1): "HIE"}.get((count.get("ND1", 0), count.get("NE2", 0)))
+        by_metal = "HIE" if "ND1" in holding else "HID" if "NE2" in holding else None
+        shown = {(1, 1): "HIP", (1, 0): "HID", (0, 1): "HIE"}
+        return shown.get((count.get("ND1", 0), count.get("NE2", 0)), by_metal)
     if template.name == "LYS":
         return {2: "LYN", 3: "LYS"}.get(count.get("NZ", 0))
     ends = sum(count.get(a, 0) for a in ("OD1", "OD2", "OE1", "OE2"))
     if ends:
         return "ASH" if template.name == "ASP" else "GLH"
     return template.name if not residue.lacks_hydrogens else None
+
+
+def _metals_of(residue: Residue, atoms: Sequence[AtomRecord], metals: Sequence[AtomRecord]) -> dict[str, str]:
+    """The atoms of HIS and CYS that bind a metal in place of a proton, by name, and which metal: `ZN A900`."""
+    found = {}
+    for name, i in residue.heavy.items():
+        for metal in metals if name in ("ND1", "NE2", "SG") else ():
+            if distance_angstrom(atoms[i], metal) < _COORDINATED_ANGSTROM:
+                found[name] = metal.label.removesuffix(f" {metal.name}")
+    return found
 
 
 def protonation_summary(
@@ -456,7 +503,7 @@ def resolve_side_chains(
         if 10.0 * least < _OVERLAP_ANGSTROM:
             raise PreparationError(
                 f"{label}: {' '.join(moved)}, which were missing, come out {10 * least:.2f} Å from another heavy atom "
-                "in every rotamer; give the residue with all its heavy atoms, or make place for it."
+                "in every rotamer; give the residue with all its heavy atoms, or make room for it."
             )
         if best is not positions_nm:
             positions_nm[:] = best

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import networkx as nx
 import numpy as np
 
+from systems.chemistry.element_data import is_metal
 from systems.chemistry.geometry import near_pairs
-from systems.chemistry.residues import template_for
-from systems.errors import PreparationError, listed
+from systems.chemistry.residues import canonical_heavy_name, template_for
+from systems.errors import PreparationError, counted, listed
 from systems.options import Preparation
 from systems.prepare.bonding import find_bonds, links_residues
 from systems.prepare.checks import check_contacts, close_gaps, handedness, made_whole, refuse_changed, say_inverted
@@ -64,7 +66,7 @@ def _prepared(found: StructureFile, options: Preparation, repairs: list[str]) ->
     structure.atoms = standardise(structure.atoms, repairs)
     bonding = find_bonds(structure.atoms, structure.conect)
     if bonding.unmade:
-        repairs.append(f"stated bonds that are not made: {listed(bonding.unmade)}")
+        repairs.append(f"bonds stated in the file but not used: {listed(bonding.unmade)}")
     ligands = ligand_atoms(structure.atoms, bonding)
     beside = resolve_ligands(
         structure.atoms, ligands, keep=options.keep_ligand, drop=options.drop_ligand, notes=repairs
@@ -84,10 +86,12 @@ def _prepared(found: StructureFile, options: Preparation, repairs: list[str]) ->
     if bonding.is_complete:
         _refuse_bare_skeletons(bonding.residues, atoms)
     else:
-        _refuse_beyond_repair(bonding)
+        _refuse_beyond_repair(bonding, atoms)
         from systems.prepare.repair import complete
 
-        atoms, bonds, summary = complete(atoms, bonding, ph=options.ph)
+        atoms, bonds, summary = complete(
+            atoms, bonding, ph=options.ph, metals=[a for a in others.atoms if is_metal(a.element)]
+        )
         repairs += summary
         now = by_residue(atoms)
         before = hands
@@ -114,6 +118,10 @@ def _choose_alternates(found: StructureFile, repairs: list[str]) -> list[int]:
     """Indices of the atoms that stay: of alternate locations the most occupied, one label for all that is bonded.
     Labels that most of the bonded residues have go first. A stated bond holds for the alternate that stays: `conect` of
     `found` is changed to that."""
+    twice = {(*a.residue_key, a.name) for a in found.atoms if a.altloc}  # beside a label, a blank is another one
+    found.atoms = [
+        replace(a, altloc="-") if not a.altloc and (*a.residue_key, a.name) in twice else a for a in found.atoms
+    ]
     atoms = found.atoms
     labelled = [i for i, a in enumerate(atoms) if a.altloc]
     if not labelled:
@@ -140,8 +148,8 @@ def _choose_alternates(found: StructureFile, repairs: list[str]) -> list[int]:
         together = ", one label for what is bonded" if groups.number_of_edges() else ""
         labels = listed([f"{''.join(each)}:{chosen[each]}" for each in occupancy])
         repairs.append(
-            f"alternate locations in {len(chosen)} residues: the most occupied kept ({labels}){together}, "
-            f"{len(atoms) - len(kept)} atoms left out"
+            f"alternate locations in {counted(len(chosen), 'residue')}: the most occupied kept ({labels}){together}, "
+            f"{counted(len(atoms) - len(kept), 'atom')} left out"
         )
     return kept
 
@@ -157,9 +165,14 @@ def _bonds_of_alternates(found: StructureFile, labelled: Sequence[int]) -> list[
     return [(i, j) for i, j in (*found.conect, *linked) if atoms[i].altloc and atoms[j].altloc]
 
 
-def _refuse_beyond_repair(bonding: Bonding) -> None:
+def _refuse_beyond_repair(bonding: Bonding, atoms: Sequence[AtomRecord]) -> None:
     for residue in bonding.residues:
         if residue.template is None or not residue.heavy:
+            template, names = residue.template, [atoms[i].name for i in residue.atoms if atoms[i].element != "H"]
+            if template and (foreign := [a for a in names if canonical_heavy_name(template, a) is None]):
+                raise PreparationError(
+                    f"{residue.label} has atoms that no {template.name} has ({listed(foreign)}); rename or delete them."
+                )
             short = next(r for r in bonding.residues if r.missing or r.lacks_hydrogens)
             raise PreparationError(
                 f"{short.label} lacks atoms that cannot be added beside {residue.label}, which is no standard residue; "
@@ -170,8 +183,8 @@ def _refuse_beyond_repair(bonding: Bonding) -> None:
         if essential or (built and template_for(residue.key[2]) is None):
             instead = ", or leave its phosphate out" if "OP3" in built else ""
             raise PreparationError(
-                f"{residue.label} lacks {' '.join(built)}; atoms are built for standard residues with a whole backbone "
-                f"alone: add all its heavy atoms{instead}."
+                f"{residue.label} lacks {' '.join(built)}; missing atoms can be built only in standard residues with a "
+                f"complete backbone: add all its heavy atoms{instead}."
             )
 
 
@@ -185,8 +198,8 @@ def _refuse_surplus_hydrogens(bonding: Bonding, atoms: Sequence[AtomRecord]) -> 
             if hydrogens and surplus > 0:
                 names = " ".join(h.name if h.residue_key == residue.key else f"and {h.label}" for h in hydrogens)
                 raise PreparationError(
-                    f"{residue.label} {name} has {len(hydrogens)} hydrogens ({names}), {surplus} too many; remove what "
-                    "it cannot have, or all hydrogens, which are then placed anew."
+                    f"{residue.label} {name} has {counted(len(hydrogens), 'hydrogen')} ({names}), {surplus} too many; "
+                    "remove what it cannot have, or all hydrogens, which are then placed anew."
                 )
 
 

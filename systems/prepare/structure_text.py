@@ -20,7 +20,7 @@ import numpy as np
 from systems.chemistry.distance_bonds import cell_of
 from systems.chemistry.element_data import element_symbol, repeats_name
 from systems.chemistry.residues import is_water_name, template_for
-from systems.errors import InputError, first_line, listed
+from systems.errors import InputError, counted, first_line, listed
 from systems.prepare.records import (
     AtomRecord,
     ResidueKey,
@@ -116,7 +116,7 @@ def _read_pdb(text: str, path: Path) -> StructureFile:
     conect_lines: list[str] = []
     header: list[str] = []
     model_ended = structure_ended = False
-    n_models = n_beyond = n_misread = 0
+    n_models = n_beyond = n_misread = n_unasked = 0
     segment = ""
     for number, line in enumerate(text.splitlines(), start=1):
         record = line[:6]
@@ -133,7 +133,9 @@ def _read_pdb(text: str, path: Path) -> StructureFile:
             model_ended = model_ended or bool(found.atoms)
         elif record == "ENDMDL":
             model_ended = bool(found.atoms)
-        elif is_atom and not model_ended:
+        elif is_atom and model_ended:
+            n_unasked += n_models < 2
+        elif is_atom:
             atom = _pdb_atom(line, number, path)
             if atom.serial in index_of:
                 repeated.add(atom.serial)
@@ -151,14 +153,18 @@ def _read_pdb(text: str, path: Path) -> StructureFile:
         elif word in ("LINK", "LINKR", "SSBOND", "CRYST1"):
             header.append(line)
     if n_misread:
-        found.notes.append(f"{n_misread} atoms whose element column repeats the atom's name: elements taken from names")
+        found.notes.append(
+            f"{counted(n_misread, 'atom')} whose element column repeats the atom's name: elements taken from names"
+        )
     if n_models > 1:
         found.notes.append(f"{n_models} models in the file: the first is taken")
+    elif n_unasked:
+        found.notes.append(f"{counted(n_unasked, 'atom')} after ENDMDL left out, of another model")
     if n_beyond:
-        found.notes.append(f"{n_beyond} atoms after END left out: they are another structure")
+        found.notes.append(f"{counted(n_beyond, 'atom')} after END left out, of another structure")
     pairs, ignored = _conect(conect_lines, index_of, repeated)
     if ignored:
-        found.notes.append(f"{ignored} CONECT entries name no single atom of the file and are ignored")
+        found.notes.append(f"CONECT entries ignored, as they name no single atom of the file: {ignored}")
     found.conect = sorted(pairs)
     if header:
         import gemmi
@@ -180,7 +186,10 @@ def _pdb_atom(line: str, number: int, path: Path) -> AtomRecord:
         )
     x, y, z = (float(text) for text in fields)
     name_field = line[12:16]
-    residue_name = line[17:21].strip()  # four letters where a program needs them (TIP3), the standard leaves one blank
+    # Column 21, blank in the standard, may hold the fourth letter of a name (TIP3), or the first of two of a chain.
+    residue_name, chain = line[17:21].strip(), line[21].strip()
+    if chain and not _is_usual(residue_name) and _is_usual(line[17:20].strip()):
+        residue_name, chain = line[17:20].strip(), line[20:22].strip()
     hetero = line.startswith("HETATM")
     symbol = element_symbol(name_field, residue_name, line[76:78].strip(), hetero=hetero) or ""
     number_read = decode(line[22:26], 4)
@@ -190,10 +199,21 @@ def _pdb_atom(line: str, number: int, path: Path) -> AtomRecord:
     except ValueError:
         occupancy = 1.0
     return AtomRecord(
-        name_field.strip() or symbol, symbol, residue_name or "UNL", line[21].strip(),
-        residue_id + line[26:27].strip(), (x, y, z), occupancy=occupancy, altloc=line[16].strip(), hetero=hetero,
+        name_field.strip() or symbol, symbol, residue_name or "UNL", chain,
+        residue_id + line[26:27].strip(), (x, y, z), occupancy=occupancy, altloc=line[16].strip(),
+        charge=_charge(line[78:80]),
         serial=(line[6:11] if line[5] == " " or hetero else line[5:11]).strip(),
     )  # fmt: skip
+
+
+def _is_usual(residue_name: str) -> bool:
+    return is_water_name(residue_name) or template_for(residue_name) is not None
+
+
+def _charge(field: str) -> int | None:
+    """Return the charge in columns 79-80 (`2+`, or as some programs write it, `+2`); None for 0 and what is none."""
+    found = re.fullmatch(r"(\d)([+-])|([+-])(\d)", field)
+    return int((found[2] or found[3]) + (found[1] or found[4])) or None if found else None
 
 
 def decode(field: str, width: int) -> int | None:
@@ -264,7 +284,9 @@ def read_blocks(text: str, path: Path, category: str) -> list[Any]:
         return [block for block in document if block.find_mmcif_category(category)]
     except (ValueError, RuntimeError) as error:
         reason = first_line(error).removeprefix("string:")
-        raise InputError(f"{path} is no whole CIF ({reason}); the file is cut or damaged, fetch it again.") from error
+        raise InputError(
+            f"{path} is not a complete CIF file ({reason}); the file is cut or damaged, fetch it again."
+        ) from error
 
 
 def _read_mmcif(text: str, path: Path) -> StructureFile:
@@ -295,7 +317,7 @@ def _read_mmcif(text: str, path: Path) -> StructureFile:
         place = residue.name or "UNL", chain, str(residue.seqid)
         x, y, z = a.pos.tolist()
         found.atoms.append(
-            AtomRecord(a.name, symbol, *place, (x, y, z), str(a.serial), a.altloc.strip("\0"), a.occ, hetero)
+            AtomRecord(a.name, symbol, *place, (x, y, z), str(a.serial), a.altloc.strip("\0"), a.occ, a.charge or None)
         )
         if k and residue.subchain != rows[k - 1][1].subchain:
             found.chain_ends.add(k - 1)
@@ -319,13 +341,11 @@ def _cleaned(found: StructureFile, path: Path) -> StructureFile:
     under one number are told apart by their chains. Raises InputError for an atom whose element is not known."""
     gone = _repeated(found.atoms)
     if gone:
-        found.notes.append(
-            f"{len(gone)} atom{'s' if len(gone) > 1 else ''} written twice on one point: one of each left out"
-        )
+        found.notes.append(f"{counted(len(gone), 'atom')} written twice at the same coordinates: one of each left out")
     sites = _sites(found.atoms, gone)
     if sites:
         names = listed(sorted({found.atoms[i].name for i in sites}))
-        found.notes.append(f"{len(sites)} virtual sites and Drude particles left out: {names}")
+        found.notes.append(f"virtual sites and Drude particles left out ({len(sites)}): {names}")
     gone |= sites
     found = found.without(gone)
     for atom in found.atoms:
@@ -398,7 +418,7 @@ def _told_apart(atoms: Sequence[AtomRecord], chain_ends: set[int], notes: list[s
             out[start:stop] = [replace(a, chain=chain) for a in atoms[start:stop]]
     peptides = {a.chain for a in out if ":" in a.chain and template_for(a.residue_name) is not None}
     if peptides:
-        notes.append(f"residue numbers come again: {listed(sorted(peptides))} are chains of their own")
+        notes.append(f"residue numbers repeat: treated as separate chains {listed(sorted(peptides))}")
     return out
 
 

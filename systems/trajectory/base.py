@@ -70,7 +70,7 @@ class TrajectoryWriter(FrameStore):
         try:
             if not append:
                 refuse_existing(path, overwrite)
-                refuse_other_companions(path)
+                refuse_other_companions(path, topology)
                 create_store(store, scene, record, self._lay_out, columns, overwrite=overwrite, run_id=run_id)
                 if topology:
                     create_whole(pdb, topology)

@@ -70,13 +70,23 @@ def topology_bytes(scene: Scene) -> bytes:
     return pdb_text(scene).encode() if scene.n_atoms <= MOST_ATOMS else b""
 
 
-def refuse_other_companions(trajectory: Path) -> None:
-    """Raise TrajectoryError where `NAME.pdb` is another program's, or `NAME.meta.h5` is of another trajectory."""
+def _atoms(pdb: bytes) -> list[bytes]:
+    """Return what PDB text says of each atom but where it is."""
+    return [line[12:27] for line in pdb.splitlines() if line.startswith((b"ATOM", b"HETATM"))]
+
+
+def refuse_other_companions(trajectory: Path, topology: bytes = b"") -> None:
+    """Raise TrajectoryError where `NAME.pdb` is another program's, or that of a trajectory of other atoms than its new
+    text `topology` has, or `NAME.meta.h5` is of another trajectory."""
     pdb, suffix = topology_path(trajectory), trajectory.suffix.lower()
     if pdb.exists() and not is_our_topology(pdb):
         raise TrajectoryError(
             f"{pdb} is not ours and would be replaced by the topology of {trajectory.name}; choose another name for it."
         )
+    beside = [p for s in (".h5", ".hdf5", *POSITIONS_ALONE) if (p := trajectory.with_suffix(s)).exists()]
+    if topology and pdb.exists() and beside not in ([], [trajectory]) and _atoms(pdb.read_bytes()) != _atoms(topology):
+        other = next(p for p in beside if p != trajectory)
+        raise TrajectoryError(f"{pdb} is the topology of {other.name}, of other atoms; choose another name.")
     for other in (trajectory.with_suffix(s) for s in POSITIONS_ALONE if suffix in POSITIONS_ALONE and s != suffix):
         if other.exists() and meta_path(other).exists():
             raise TrajectoryError(f"{meta_path(other)} is the record of {other.name}; choose another name.")

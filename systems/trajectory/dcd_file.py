@@ -269,7 +269,7 @@ class DcdReader(CompanionReader):
             return cells_of_blocks(blocks, self._layout.byte_order, self._layout.charmm_version)
         except ValueError as error:
             raise TrajectoryError(
-                f"{self.path}: its unit cell is no cell ({error}); take the cell out of it."
+                f"{self.path}: its unit-cell record is invalid ({error}); rewrite the file without it."
             ) from error
 
     def close(self) -> None:

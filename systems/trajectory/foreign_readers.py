@@ -108,7 +108,7 @@ class MdtrajReader(_InMemory):
         whole = self._load(None if stated is None or self._format.names_atoms else stated.to_mdtraj_topology())
         self._positions = np.asarray(whole.xyz, dtype=np.float32)
         cells = whole.unitcell_vectors
-        self._cells = None if cells is None else np.asarray(cells, dtype=np.float64)
+        self._cells = None if cells is None or not cells.any() else np.asarray(cells, dtype=np.float64)
         self.n_frames, self.n_atoms = whole.n_frames, whole.n_atoms
         self.time_ps = np.asarray(whole.time, dtype=np.float64)
         self.times_known = self._format.times != NONE
@@ -181,7 +181,7 @@ class StreamReader(TrajectoryReader):
                 has, self._has_cell = _trr_frames(seen)
                 self._kept, self.time_ps = np.flatnonzero(has), self.time_ps[has]
                 if not has.all():
-                    self.notes = (f"{(~has).sum()} frames hold no positions and are left out.",)
+                    self.notes = (f"frames without positions, left out: {(~has).sum()}.",)
         except Exception as error:  # MDTraj raises errors of many classes
             self._links.close()
             raise TrajectoryError(f"{path} cannot be read: {first_line(error)}.") from error
@@ -202,7 +202,7 @@ class StreamReader(TrajectoryReader):
             unit = getattr(variable, "units", usual)
             unit = unit.decode(errors="replace") if isinstance(unit, bytes) else unit
             if unit != usual or float(np.squeeze(getattr(variable, "scale_factor", 1.0))) != 1.0:
-                raise TrajectoryError(f"{self.path}: {name} are scaled, or in {unit!r}; write them in {usual}.")
+                raise TrajectoryError(f"{self.path}: its {name!r} is scaled or in {unit!r}; rewrite it in {usual!r}.")
 
     def _stored(self, start: int, stop: int) -> list[Any]:
         """Return what MDTraj reads of frames: positions and times, then steps and boxes, or lengths and angles."""
@@ -215,20 +215,25 @@ class StreamReader(TrajectoryReader):
             raise TrajectoryError(f"{self.path} is damaged in frames {start} to {stop} ({reason}).") from error
         return [x if x is None or self._kept is None else np.asarray(x)[kept - kept[0]] for x in stored]
 
-    def _read(self, start: int, stop: int, stride: int) -> Float32Array:
+    def _blocks(self, start: int, stop: int, stride: int) -> Iterator[list[Any]]:
+        """What MDTraj reads of each `stride`-th frame, as `_stored` returns it, a block at a time."""
         block = max(_PASS_FRAMES // stride, 1) * stride
-        parts = [self._stored(k, min(k + block, stop))[0][::stride] for k in range(start, stop, block)]
+        for k in range(start, stop, block):
+            yield [x if x is None else np.asarray(x)[::stride] for x in self._stored(k, min(k + block, stop))]
+
+    def _read(self, start: int, stop: int, stride: int) -> Float32Array:
+        parts = [stored[0] for stored in self._blocks(start, stop, stride)]
         return np.concatenate(parts).astype(np.float32, copy=False) * np.float32(self._nm)
 
     def _read_cells(self, start: int, stop: int, stride: int) -> Float64Array | None:
         if start >= stop:
             return np.empty((0, 3, 3))
-        stored = self._stored(start, stop)
-        if stored[3] is None or not self._has_cell:
+        parts = [stored[2:4] for stored in self._blocks(start, stop, stride)]
+        if parts[0][1] is None or not self._has_cell:
             return None
-        cells = np.asarray(stored[3], dtype=np.float64)[::stride]
+        cells = np.concatenate([part[1] for part in parts]).astype(np.float64)
         if self._format.name == "NetCDF (Amber)":
-            return read_cells(np.asarray(stored[2])[::stride] * _NM, cells)
+            return read_cells(np.concatenate([part[0] for part in parts]) * _NM, cells)
         return cells if cells.any() else None
 
     def close(self) -> None:
@@ -307,7 +312,7 @@ class MdanalysisReader(TrajectoryReader):
             raise InputError(f"{self.path} holds no positions.")
         if not has.all():
             self._kept = np.flatnonzero(has)
-            self.notes += (f"{(~has).sum()} frames hold no positions and are left out.",)
+            self.notes += (f"frames without positions, left out: {(~has).sum()}.",)
             self.n_frames, times = int(has.sum()), times[has]
         return times, known
 

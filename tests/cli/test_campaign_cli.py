@@ -185,7 +185,7 @@ def test_killed_and_interrupted_a_campaign_goes_on_to_the_same_frames(tmp_path: 
             _, said = process.communicate(timeout=120)
             assert process.returncode == 130
             assert "of 3 runs in c are complete" in said
-            assert "the same command goes on" in said
+            assert "run the same command to continue" in said
             assert said.count("\n") == 1, said
             assert _gone(workers)
         if case != "undisturbed":

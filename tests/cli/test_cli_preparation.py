@@ -52,4 +52,4 @@ def test_what_was_left_out_is_said_once_a_line(tmp_path: Path, wet: str) -> None
     assert done.exit_code == 0
     assert done.stderr == f"{wet}: 1 water molecule and free ion CL left out\n"
     refused = RUNNER.invoke(app, ["plan", wet, "--keep-water"])
-    assert refused.exit_code == 1 and "--keep-water needs a solvent of molecules" in refused.stderr
+    assert refused.exit_code == 1 and "--keep-water needs an explicit solvent" in refused.stderr

@@ -82,7 +82,7 @@ def test_reference_takes_a_model_system_s_own_settings_and_says_so(tmp_path: Pat
         (["plan", "aspirin", "--temperature", "hot"], "--temperature"),
         (["plan", "aspirin", "--protocol", "md71"], "Did you mean 'md17'?"),
         (["plan", "double-well", "--protocol", "md17"], "leave --protocol out"),
-        (["plan", "double-well", "--force-field", "ff14SB"], "its own law"),
+        (["plan", "double-well", "--force-field", "ff14SB"], "its own potential"),
     ],
 )
 def test_what_cannot_be_is_refused_in_one_line(arguments: list[str], said: str) -> None:

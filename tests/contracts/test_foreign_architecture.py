@@ -58,7 +58,7 @@ class TestRandomWalk(PropagatorContract):
     reflects = True
     permutes = True
     noise_is_vectors = True
-    # There is no network whose products bf16 would round.
+    # There is no network whose products bf16 is too coarse.
     bf16_error = None
 
     def make(self, n_atoms: int) -> Propagator:
@@ -93,7 +93,7 @@ def test_springs_are_fitted_and_rolled_by_name(tmp_path: Path) -> None:
         x = reader.read()
     off = lengths(x) - lengths(scene.positions_nm[None])
     assert reader.n_frames == 10 and 0.001 < off.std() < 0.006, "about as wide as the reference, 0.0028 nm"
-    with pytest.raises(InputError, match="bf16 would round"):
+    with pytest.raises(InputError, match="bf16 is too coarse"):
         ChunkSampler(load_weights(weights), precision="bf16")
 
 

@@ -13,7 +13,7 @@ from surrogate.models.conformance import PropagatorContract
 from surrogate.models.peptides.chains import MOST_TORSIONS, conditioning_states
 from surrogate.models.peptides.layout import PeptideConfig, chain_layout, chain_scale
 from surrogate.models.peptides.model import PeptideSlide
-from surrogate.models.propagator import Molecule, Propagator
+from surrogate.models.propagator import Chunk, Molecule, Propagator
 from systems.errors import InputError
 from systems.prepare.peptide import build_peptide
 from systems.scene import Scene
@@ -74,6 +74,18 @@ class TestPeptideSlide(PropagatorContract):
     def state(self, n_atoms: int, batch: int, model: Propagator) -> tuple[Tensor, Tensor]:
         scene = scene_of(n_atoms)
         return shaken(scene, batch, 1), torch.zeros(batch, n_atoms, 3)
+
+
+class TestPeptideSlideAdaptive(TestPeptideSlide):
+    """With dopri5: rows do not depend on each other's steps."""
+
+    sizes = (22,)
+    # Steps are chosen anew in bf16.
+    bf16_error = 0.1
+
+    def call(self, model: Propagator, frames: Tensor, molecule: Molecule, noise: Tensor, velocities: Tensor) -> Chunk:
+        with torch.no_grad():
+            return model.next_chunk(frames, molecule, noise, solver_steps=1, solver="dopri5")
 
 
 def test_innovations_come_back_and_have_unit_variance_for_a_process_of_these_correlations() -> None:

@@ -248,7 +248,7 @@ def test_charges_are_announced_where_they_take_long(caplog: pytest.LogCaptureFix
     assert not caplog.records
     announce(replace(load("aspirin"), name="aspirin"))
     (record,) = caplog.records
-    assert "aspirin: AM1-BCC charges of 21 atoms, about 2 s on an idle core" in record.getMessage()
+    assert "aspirin: computing AM1-BCC charges for 21 atoms (about 2 s on an idle core)" in record.getMessage()
 
 
 @needs_ambertools

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cache
 from typing import Any
 
 import numpy as np
 import pytest
 from md_speed import plain_system
+from openmm import NonbondedForce
 
 from md_reference.forces.forcefield import build_system
 from md_reference.forces.spec import ForceFieldSpec
@@ -245,9 +247,30 @@ def test_the_radii_of_one_force_field_are_refused_with_another() -> None:
         ForceFieldSpec("ff14SB", "amber99-obc")
 
 
+@pytest.mark.parametrize(
+    ("element", "residue", "charge", "force_field", "solvent"),
+    [("Fe", "FE", 3, "ff14SB", "vacuum"), ("Fe", "FE", 2, "ff14SB", "obc2"), ("Fe", "XX", 3, "ff19SB", "vacuum"),
+     ("Cu", "CU1", 1, "ff14SB", "refused"), ("Mn", "MN3", 3, "ff14SB", "refused"),
+     ("Cl", "MOL", -1, "ff99SB-ILDN", "vacuum")],
+)  # fmt: skip
+def test_ions_have_the_charge_of_the_scene(
+    element: str, residue: str, charge: int, force_field: str, solvent: str
+) -> None:
+    ion = replace(
+        prepare("smiles:[Cl-]"), elements=(element,), residue_names=(residue,), formal_charges=np.array([charge])
+    )
+    if solvent == "refused":
+        with pytest.raises(PreparationError, match=rf"has no {element} ion of charge \+{charge}, only \+2"):
+            build_system(ion, ForceFieldSpec(force_field, "vacuum"))
+        return
+    system = build_system(ion, ForceFieldSpec(force_field, solvent))
+    (nonbonded,) = (f for f in system.getForces() if isinstance(f, NonbondedForce))
+    assert nonbonded.getParticleParameters(0)[0]._value == charge
+
+
 @pytest.mark.parametrize("smiles", ["[H]", "[H+]", "[O]"])
 def test_a_lone_atom_that_is_no_ion_blames_no_flag(smiles: str) -> None:
-    with pytest.raises(PreparationError, match="a lone atom") as caught:
+    with pytest.raises(PreparationError, match="a single atom") as caught:
         build_system(prepare(f"smiles:{smiles}"), ForceFieldSpec("auto", "auto"))
     assert "force_field" not in str(caught.value) and "gfn2-xtb" in str(caught.value)
     assert build_system(prepare("smiles:[Cl-]"), ForceFieldSpec("auto", "auto")).getNumParticles() == 1, "control"

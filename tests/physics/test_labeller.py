@@ -5,7 +5,10 @@ from __future__ import annotations
 import multiprocessing
 import os
 import signal
+import subprocess
+import sys
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,11 +17,20 @@ from md_reference.forces.quantum import Potential, refuse_rearranged
 from md_reference.run.labeller import Labeller
 from systems.chemistry.graph import bonded_graph, turned
 from systems.chemistry.validity import changed_stereo
-from systems.errors import PreparationError
+from systems.errors import PreparationError, SimulationError
 from systems.prepare.molecule import scene_from_smiles
 from systems.scene import FloatArray, Scene
 
 pytest.importorskip("tblite")
+
+
+def test_a_script_that_labels_while_it_is_imported_ends(tmp_path: Path, repository: Path) -> None:
+    script = "from systems.prepare.molecule import scene_from_smiles\nfrom md_reference.run.labeller import Labeller\n"
+    script += "scene = scene_from_smiles('O')\nLabeller(scene, workers=2).label(scene.positions_nm[None])\n"
+    (tmp_path / "script.py").write_text(script)
+    run = subprocess.run([sys.executable, str(tmp_path / "script.py")], capture_output=True, text=True, check=False,
+                         env=os.environ | {"PYTHONPATH": str(repository)}, timeout=120)  # fmt: skip
+    assert run.returncode == 1 and "`if __name__ == '__main__':`" in run.stderr
 
 
 def test_answers_are_the_potentials_own_whoever_computes_them() -> None:
@@ -31,6 +43,9 @@ def test_answers_are_the_potentials_own_whoever_computes_them() -> None:
         for worker in multiprocessing.active_children():
             os.kill(worker.pid, signal.SIGINT)
         np.testing.assert_array_equal(many.label(states).energies_kj_mol, there.energies_kj_mol)
+        os.kill(multiprocessing.active_children()[0].pid or 0, signal.SIGKILL)
+        with pytest.raises(SimulationError, match="a labelling process ended unexpectedly"):
+            many.label(np.repeat(states, 20, axis=0))
     for k, state in enumerate(states):
         energy, forces = Potential(scene)(state)
         for found in (here, there):

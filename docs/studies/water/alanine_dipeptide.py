@@ -40,7 +40,7 @@ from systems.units import parse_time_ps, quantity
 
 SPEC = ForceFieldSpec("ff14SB", "tip3p")
 VOLUME_PS, DISCARDED = 500.0, 0.2
-SETTLED = 200
+SETTLED_PS = 200.0
 
 
 def at_one_bar(scene: Scene, *, seed: int) -> Scene:
@@ -59,8 +59,8 @@ def at_one_bar(scene: Scene, *, seed: int) -> Scene:
     return replace(scene, positions_nm=state.positions_nm * scale, cell_nm=state.cell_nm * scale)
 
 
-def angles_of(folder: Path, kind: str) -> list[FloatArray]:
-    """Return phi and psi `(n_frames, 2)` in radians of each replica, frames 1 ps apart."""
+def angles_of(folder: Path, kind: str, every_ps: float = 1.0) -> list[FloatArray]:
+    """Return phi and psi `(n_frames, 2)` in radians of each replica, frames `every_ps` apart."""
     found = []
     for k in range(len(list(folder.glob(f"{kind}_r*.h5")))):
         with open_trajectory(folder / f"{kind}_r{k}.h5") as reader:
@@ -69,12 +69,14 @@ def angles_of(folder: Path, kind: str) -> list[FloatArray]:
             backbone = [i for i, name in enumerate(names) if name in ("C", "N", "CA")][:5]
             assert [names[i] for i in backbone] == ["C", "N", "CA", "C", "N"]
             quads = np.array([backbone[:4], backbone[1:]])
-            found.append(np.asarray(torsion(reader.read()[SETTLED:].astype(np.float64), quads)))
+            lag_ps = float(reader.time_ps[1] - reader.time_ps[0])
+            frames = reader.read(round(SETTLED_PS / lag_ps), None, max(1, round(every_ps / lag_ps)))
+            found.append(np.asarray(torsion(frames.astype(np.float64), quads)))
     return found
 
 
-def memory_ps(values: Sequence[FloatArray]) -> float:
-    """Return the integral of the autocorrelation of series of equal steps of 1 ps, up to where it is below 0.05."""
+def memory_ps(values: Sequence[FloatArray], every_ps: float = 1.0) -> float:
+    """Return the integral of the autocorrelation of series of equal steps, up to where it is below 0.05."""
     mean, variance = np.concatenate(values).mean(), np.concatenate(values).var()
     total = 0.5
     for lag in range(1, min(map(len, values))):
@@ -82,7 +84,7 @@ def memory_ps(values: Sequence[FloatArray]) -> float:
         if now < 0.05:
             break
         total += float(now)
-    return total
+    return every_ps * total
 
 
 def with_error(of: Callable[[Sequence[FloatArray]], float], runs: Sequence[FloatArray]) -> str:

@@ -56,15 +56,15 @@ def _finite_values(segments: Sequence[AnyFloat]) -> FloatArray:
     return values[np.isfinite(values)]
 
 
-def reference_bins(segments: Sequence[AnyFloat], n: int = 100) -> Bins:
-    """Return bins over the finite values of the reference, from its least to its greatest and 5 % beyond: without that
-    the reference alone would have nothing outside its range, and any replicate would stand out."""
+def reference_bins(segments: Sequence[AnyFloat]) -> Bins:
+    """Return 100 bins over the finite values of the reference, from its least to its greatest and 5 % beyond: without
+    that the reference alone would have nothing outside its range, and any replicate would stand out."""
     values = _finite_values(segments)
     if not len(values):
-        return Bins(0.0, 1.0, n)
+        return Bins(0.0, 1.0, 100)
     low, high = float(values.min()), float(values.max())
     margin = max(0.05 * (high - low), 1e-9)
-    return Bins(low - margin, high + margin, n)
+    return Bins(low - margin, high + margin, 100)
 
 
 def normal_bins(segments: Sequence[AnyFloat], n: int = 100) -> Bins:

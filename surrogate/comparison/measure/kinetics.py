@@ -18,6 +18,7 @@ from surrogate.comparison.measure.distributions import count_in_blocks
 from surrogate.comparison.measure.statistics import AnyFloat, Blocks, FloatArray, IntArray
 
 MAX_LAG_FRAMES = 50_000
+TICA_LAG_PS = 10.0
 # Fewer frames for each feature, and TICA means nothing.
 _FRAMES_A_FEATURE = 2
 WITHOUT_TICA = "the torsions of the reference do not move, or its frames are too few for so many torsions"
@@ -175,6 +176,11 @@ class Projection(NamedTuple):
             return np.asarray((np.asarray(features, dtype=np.float64) - self.mean) @ self.matrix)
 
 
+def tica_lag(lag_ps: float) -> int:
+    """Return the lag of TICA in frames `lag_ps` apart."""
+    return max(1, round(TICA_LAG_PS / lag_ps))
+
+
 def fit_projection(
     segments: Sequence[FloatArray], lag_frames: int, dim: int = MAX_DIMENSIONS, *, least: float = 0.01
 ) -> Projection | None:
@@ -186,6 +192,7 @@ def fit_projection(
     Theory Comput. 11, 5002 (2015).
     """
     from deeptime.decomposition import TICA
+    from deeptime.numeric import ZeroRankError
 
     runs = [run for s in segments for run in finite_runs(s) if len(run) > lag_frames and run.shape[1]]
     if not runs or max(float(run.std(0).max()) for run in runs) < 1e-9:
@@ -195,7 +202,10 @@ def fit_projection(
     covariance = TICA.covariance_estimator(lagtime=lag_frames)
     for run in runs:
         covariance.partial_fit((run[:-lag_frames], run[lag_frames:]))
-    model = TICA(lagtime=lag_frames, dim=dim).fit_from_covariances(covariance).fetch_model()
+    try:
+        model = TICA(lagtime=lag_frames, dim=dim).fit_from_covariances(covariance).fetch_model()
+    except ZeroRankError:  # nothing varies by more than rounding
+        return None
     values = np.real(np.asarray(model.singular_values))[:dim]
     kept = max(int((values > least).sum()), 1)
     vectors = np.real(np.asarray(model.singular_vectors_left))[:, :kept]

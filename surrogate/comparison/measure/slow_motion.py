@@ -18,7 +18,6 @@ _MOST_FOLLOWED = 48
 _SCREENING_BLOCKS = (8, 40)
 # TICA finds slow combinations in noise unless there are this many frames a feature.
 _FRAMES_A_FEATURE = 20
-_TICA_LAG_PS = 10.0
 _ANGLE_BINS = 36
 # States apart are angles that one side has so many times as often, with so large a share of its frames.
 _TIMES_AS_OFTEN, _LEAST_APART = 10.0, 0.3
@@ -38,10 +37,10 @@ def longest_correlation(*features: Features) -> float:
     return max((t for t in times if math.isfinite(t)), default=1.0)
 
 
-def rarely_crossed(references: Sequence[Features], candidate: Features) -> list[str]:
+def rarely_crossed(references: Sequence[Features], candidate: Features, torsions: Backbone | None = None) -> list[str]:
     """Return the torsions by which candidate and reference lie in different states that hardly any run passes between:
-    replicas of one simulation do that, too."""
-    runs = [angles_of([t]) for t in (*references, candidate)]
+    replicas of one simulation do that, too. `torsions`: by which φ and ψ are named."""
+    runs = [angles_of([t], torsions) for t in (*references, candidate)]
     found = []
     for k, (label, own) in enumerate(runs[-1]):
         p, q = _density(own), _density([x for angles in runs[:-1] for x in angles[k][1]])
@@ -141,7 +140,7 @@ def tic_0(features: Sequence[Features]) -> list[FloatArray] | None:
     """Return TIC 0 of all torsions, fitted on all trajectories together; None where frames are too few."""
     parts = [x for f in features for x in tica_features(f)]
     n_features = parts[0].shape[1]
-    lag = max(1, round(_TICA_LAG_PS / features[0].lag_ps))
+    lag = kinetics.tica_lag(features[0].lag_ps)
     n_frames = sum(map(len, parts))
     if not n_features or n_frames < _FRAMES_A_FEATURE * n_features or max(map(len, parts)) < 10 * lag:
         return None

@@ -158,8 +158,9 @@ class Wells(NamedTuple):
         return [np.where(np.isfinite(x), s, -1) for x, s in zip(segments, self.assign(segments), strict=True)]
 
 
-def find_wells(*samples: Segments) -> Wells:
-    """Return the states of an angle: peaks of its density, mean over the samples, that a deep enough minimum parts."""
+def find_wells(*samples: Segments, fold: int = 1) -> Wells:
+    """Return the states of an angle: peaks of its density, mean over the samples, that a deep enough minimum parts. Of
+    an angle times its `fold` names are in degrees of the angle itself."""
     density = np.zeros(_BINS)
     for segments in filter(len, samples):
         values = np.concatenate([np.asarray(x, dtype=np.float64) for x in segments])
@@ -175,7 +176,7 @@ def find_wells(*samples: Segments) -> Wells:
         return Wells(np.zeros(_BINS, dtype=np.int64), ("",))
     of_bin = np.searchsorted(edges, np.arange(_BINS), side="right") - 1
     of_bin = np.where(of_bin < 0, len(edges) - 1, of_bin)
-    degrees = [5 * e - 180 for e in edges]
+    degrees = [f"{(5 * e - 180) / fold:.3g}" for e in edges]
     names = tuple(f"{a}° to {b}°" for a, b in zip(degrees, degrees[1:] + degrees[:1], strict=True))
     rim = np.concatenate([(edges - 2) % _BINS, (edges - 1) % _BINS, edges, (edges + 1) % _BINS])
     cores = of_bin.copy()

@@ -317,7 +317,7 @@ def intervention_notes(label: str, records: Sequence[dict[str, Any]]) -> list[st
     chunks, caught = (sum(int(a.get(key, 0)) for a in summaries) for key in ("chunks", "chunks_caught"))
     done = ", ".join(f"{n} {name}" for name, n in frames.items())
     return [
-        f"{label}: guard {summaries[0].get('guard')} stepped in in {caught} of {chunks} chunks; frames that are not "
+        f"{label}: guard {summaries[0].get('guard')} intervened in {caught} of {chunks} chunks; frames that are not "
         f"the model's first draw: {done}. What that may do: {'; '.join(bias)}."
     ]
 

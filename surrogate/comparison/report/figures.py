@@ -69,7 +69,7 @@ _MOST_ROWS, _MOST_HISTOGRAMS, _MOST_ANSWER_MAPS = 4, 6, 6
 _TITLES: dict[Section, str] = {
     "equivalent_time": "Equivalent MD time",
     "distributions": "Distributions",
-    "kinetics": "How fast things move",
+    "kinetics": "Kinetics",
     "structure": "Structure",
 }
 
@@ -285,7 +285,7 @@ def albums(charts: Sequence[Chart], temperature_k: float) -> list[Album]:
         drawn = [figure for chart in others[:_MOST_CHARTS] for figure in draw_chart(chart, temperature_k)]
         n_left = max(len(others) - _MOST_CHARTS, 0)
         if drawn:
-            out.append(Album(title, drawn, f"{n_left} more stand in the JSON file." if n_left else ""))
+            out.append(Album(title, drawn, f"{n_left} more are in the JSON file." if n_left else ""))
     return out
 
 
@@ -332,7 +332,7 @@ def answer_overview(molecule: str, answer: dict[str, Any]) -> MatplotlibFigure:
     from matplotlib.figure import Figure
 
     maps = list(answer.get("maps_kj_mol", {}).items())[:_MOST_ANSWER_MAPS]
-    states = [s for s in answer.get("states", []) if not s["missing"]]
+    states = [s for s in answer.get("states", []) if s.get("is_known", not s["missing"])]
     figure: Any = Figure(figsize=(4.0 * (1 + len(maps)), max(3.5, 0.22 * len(states))), layout="constrained")
     bars, *others = figure.subplots(1, 1 + len(maps), squeeze=False)[0]
     shares, errors = ([s[key] for s in states] for key in ("share", "error"))

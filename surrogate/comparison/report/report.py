@@ -102,8 +102,9 @@ def render(comparison: Comparison, template: str = PAGE, *, command: str, forewo
         lstrip_blocks=True,
     )
     environment.filters.update(
-        number=number, interval=interval, time=format_time_ps, plain=plain, setting=setting, sort_key=sort_key
-    )
+        number=number, interval=interval, time=format_time_ps, plain=plain, setting=setting, sort_key=sort_key,
+        sentence=lambda text: text[:1].upper() + text[1:],
+    )  # fmt: skip
 
     def joined(*names: str) -> Markup:
         assert environment.loader is not None
@@ -153,10 +154,12 @@ def _command(comparison: Comparison, target: Path) -> str:
     words = ["surromd", "compare", *(",".join(a.sources) or a.label for a in summaries)]
     if comparison.replicate is not None:
         words += [flag_of("replicate"), ",".join(comparison.replicate.sources) or comparison.replicate.label]
-    if comparison.reference.top is not None:
-        words += [flag_of("top"), comparison.reference.top]
-    if comparison.reference.stated_lag_ps is not None:
-        words += [flag_of("dt_ps"), format_time_ps(comparison.reference.stated_lag_ps).replace(" ", "")]
+    everyone = [*summaries, *([] if comparison.replicate is None else [comparison.replicate])]
+    lags = [s.stated_lag_ps and format_time_ps(s.stated_lag_ps).replace(" ", "") for s in everyone]
+    for name, given in (("top", [s.top for s in everyone]), ("dt_ps", lags)):
+        # One stands for all.
+        for x in given if len(set(given)) > 1 else filter(None, given[:1]):
+            words += [flag_of(name), str(x or "-")]
     return shlex.join([*words, "-o", target.name])
 
 

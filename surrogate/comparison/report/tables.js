@@ -69,7 +69,7 @@
       const box = document.createElement("input");
       box.type = "checkbox";
       const filter = document.createElement("label");
-      filter.append(box, " only what is off");
+      filter.append(box, " hide what agrees");
       box.addEventListener("change", () => table.classList.toggle("only-off", box.checked));
       bar.append(filter);
     }

@@ -175,11 +175,11 @@ def relaxation_of(sample: Sample, k: int = 0) -> tuple[Estimate, Estimate]:
 def slow_rows(inputs: ComparisonInput) -> Measured:
     """Return rows and charts of TIC 0 and of a Markov state model, both fitted on the reference alone, and what was
     left out."""
-    lag = max(1, round(inputs.options.tica_lag_ps / inputs.lag_ps))
+    lag = kinetics.tica_lag(inputs.lag_ps)
     name = f"TICA at a lag of {format_time_ps(lag * inputs.lag_ps)}"
     features = [tica_features(s.features) for s in inputs.samples]
     if not features[0][0].shape[1]:
-        return left_out(name, "the scene has no torsion to turn about")
+        return left_out(name, "no rotatable torsion")
     if short := inputs.too_short(lag):
         return left_out(name, short)
     projection = kinetics.fit_projection(features[0], lag)

@@ -114,10 +114,13 @@ def peptide_charts(inputs: ComparisonInput) -> Measured:
         return left_out(name, kinetics.WITHOUT_TICA)
     candidate, replicate = (peptide_table(fit, reference, other) for other in others)
     known = np.isfinite(replicate)
-    n_states = "none" if fit.model is None else str(fit.model.n_states)
+    states = "no Markov state model"
+    if fit.model is not None:
+        n_clusters, n_states = len(fit.model.centres), fit.model.n_states
+        states = f"a Markov state model of {n_clusters} clusters and {n_states} metastable states"
     caption = (
         "Jensen-Shannon distances to the reference (natural logarithm), as MDGen, JAMUN and LaM-SLidE print them: 100 "
-        f"and 50 × 50 bins, TICA and MSM at 100 ps, 100 clusters, {n_states} metastable states. Not evaluated."
+        f"and 50 × 50 bins, TICA at 100 ps, {states}. Not evaluated."
     )
     names = tuple(n for n, k in zip(TABLE, known, strict=True) if k)
     numbers = [np.zeros(len(names)), candidate[known], replicate[known]]

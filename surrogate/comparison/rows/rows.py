@@ -55,14 +55,12 @@ GROUPS: tuple[Group, ...] = ("validity", "structure", "populations", "distributi
 
 @dataclass(frozen=True)
 class Options:
-    """Settings of a comparison. `tica_lag_ps` is rounded to whole frames. `peptide_recipe`: whether the published
-    recipe is followed too (it takes most of the time of a short comparison, and no verdict rests on it)."""
+    """Settings of a comparison. `peptide_recipe`: whether the published recipe is followed too (it takes most of the
+    time of a short comparison, and no verdict rests on it)."""
 
-    tica_lag_ps: float = 10.0
     n_bootstrap: int = 400
     n_permutations: int = 1000
     seed: int = 0
-    significance: float = 0.05
     peptide_recipe: bool = True
 
 
@@ -94,7 +92,7 @@ class Quantity:
         """Return such as 'radius of gyration, mean: 3.1 Å instead of 3.4 Å'."""
         name = lower_first(self.name) + (f", {where}" if where else "")
         if not math.isfinite(candidate):
-            return f"{name}: it does not move"
+            return f"{name}: {'it does not move' if self.unit == 'ps' else 'not defined'}"
         digits = 3 if f"{candidate:.3g}" != f"{reference:.3g}" else 5
         shown = (f"{x:.{digits}g}{'' if self.unit == '°' else ' '}{self.unit}".rstrip() for x in (candidate, reference))
         return f"{name}: {' instead of '.join(shown)}{self.hint}"
@@ -339,7 +337,7 @@ def mean_distance(
         return np.stack([np.sum(x, axis=0) for x in each], axis=1)
 
     three = [counts(s, v) for s, v in zip(inputs.samples, segments, strict=True)]
-    metric = f"{name}, distance" if len(bins) == 1 else f"{name}, mean distance of {len(bins)}"
+    metric = f"{name}, distance" if len(bins) == 1 else f"{name}, mean distance over {len(bins)}"
     return distance_row(inputs, three, key, group, metric)
 
 

@@ -138,7 +138,7 @@ def temperature_rows(inputs: ComparisonInput) -> Measured:
         for s in inputs.samples
     ]
     low, high = bounds(columns[0])
-    spread = np.concatenate(columns[0]).std(axis=0)
+    spread = np.nanstd(np.concatenate(columns[0]), axis=0)
     rounding = _rounding_variance(inputs, np.nanmean(np.concatenate(columns[0]), axis=0))
     loose = spread > 10 * CONSTRAINED_BELOW_NM
     moving = np.flatnonzero(loose & (spread**2 > 2.0 * rounding))
@@ -165,10 +165,9 @@ def _rounding_variance(inputs: ComparisonInput, means: FloatArray) -> FloatArray
     grid_nm, bonds = inputs.reference.features.grid_nm, inputs.geometry.bond_idx
     out = np.full(len(means), length_error_nm(grid_nm) ** 2)
     if grid_nm > 0:
-        length = {frozenset(pair): r for pair, r in zip(bonds.tolist(), means.tolist(), strict=False)}
-        arms = np.array([[length[frozenset((b, x))] for x in (a, c)] for a, b, c in inputs.probes.angles.tolist()])
-        arms = arms.reshape(-1, 2)
-        out[len(bonds) :] = angle_variance(arms[:, 0], arms[:, 1], means[len(bonds) :], grid_nm)
+        x, (a, b, c) = inputs.scene.positions_nm, inputs.probes.angles.T
+        first, second = (np.linalg.norm(x[end] - x[b], axis=1) for end in (a, c))
+        out[len(bonds) :] = angle_variance(first, second, means[len(bonds) :], grid_nm)
     return out
 
 

@@ -83,6 +83,7 @@ _NAMES: dict[TorsionKind, str] = {
     "χ": "Side-chain torsions χ",
     "rotatable": "Rotatable torsions",
     "rotor": "Rotors (methyl, hydroxyl, ammonium)",
+    "ring": "Ring puckers",
 }
 # A state that holds less of the frames of any of the three is left out of what moves within states.
 _LEAST_SHARE = 0.05
@@ -90,7 +91,6 @@ _MOST_TORSIONS = 8
 _LEAST_IN_STATE = 0.01
 _N_STATES = 4
 _STREAM = 40
-_TICA_LAG_PS = 10.0
 _WITHOUT_STRAYS = (0.0005, 0.9995)
 
 
@@ -106,7 +106,7 @@ def population_rows(inputs: ComparisonInput) -> Measured:
     found += [("φ > 0", x) for x in inputs.torsions.phi_labels]
     n_psi = len(inputs.torsions.psi_labels)
     if not found:
-        return left_out("Torsion distributions, basins, autocorrelation", "the scene has no φ or ψ torsion")
+        return left_out("Backbone torsions φ, ψ and their basins", "the scene has no φ or ψ torsion")
 
     def members(f: Features) -> list[AnyFloat]:
         angles = zip(f.phi, f.psi, strict=True)
@@ -138,7 +138,7 @@ def torsion_rows(inputs: ComparisonInput) -> Measured:
         for part in [list(group)] if many else ([one] for one in group):
             label = f"mean of {len(part)} residues" if many else part[0].label
             counts = [np.stack(of_sample, axis=1) for of_sample in zip(*(x.counts for x in part), strict=True)]
-            metric = f"{part[0].name} distance, {label}"
+            metric = f"Distance of {part[0].name}, {label}"
             rows.append(distance_row(inputs, counts, f"{key}:{label}", "distributions", metric))
     charts: list[Chart] = [_map(inputs, residue) for residue in evenly(inputs.torsions.residues, _MOST_DRAWN)]
     for symbol, name, labels in _phi_psi(inputs):
@@ -162,7 +162,7 @@ class _Histogram(NamedTuple):
     def at_negative_phi(self, bins: Bins) -> _Histogram:
         """Return the same without phi > 0."""
         counts = [without_positive_phi(c, bins.n) for c in self.counts]
-        return self._replace(name=f"{self.name} at φ < 0", counts=counts)
+        return self._replace(name=f"{self.name} (φ < 0 only)", counts=counts)
 
 
 def _histograms(inputs: ComparisonInput, many: bool) -> Iterator[_Histogram]:
@@ -170,7 +170,7 @@ def _histograms(inputs: ComparisonInput, many: bool) -> Iterator[_Histogram]:
     residues, rare = inputs.torsions.residues, frozenset[int]() if many else rare_residues(inputs)
     for residue in evenly(residues, MOST_MAPS) if many else residues:
         counts = [joint_counts(s.features, s.blocks, residue) for s in inputs.samples]
-        found = _Histogram("joint_jsd", "Joint φ/ψ", residue.label, counts)
+        found = _Histogram("joint_jsd", "the φ/ψ map", residue.label, counts)
         yield found.at_negative_phi(RAMACHANDRAN_BINS) if residue.phi in rare else found
     for symbol, angle, labels in _phi_psi(inputs):
         for k, label in evenly(list(enumerate(labels)), MOST_HISTOGRAMS if many else len(labels)):
@@ -224,12 +224,13 @@ def visits_of(phi: Sequence[AnyFloat]) -> Visits:
 
 def rare_residues(inputs: ComparisonInput) -> frozenset[int]:
     """Return the columns of phi whose positive side reference and replicate together visit fewer than ten times, in a
-    small share of their frames, and which any of the three visits at all."""
+    small share of their frames, and which any of the three visits at all, but none all along."""
     found = []
     for k in range(len(inputs.torsions.phi_labels)):
-        reference, candidate, replicate = map(visits_of, inputs.column("phi", k))
+        three = list(map(visits_of, inputs.column("phi", k)))
+        reference, candidate, replicate = three
         source = reference + replicate
-        small = source.inside < _SMALL_SHARE * source.n_frames
+        small = source.inside < _SMALL_SHARE * source.n_frames and all(v.inside < v.n_frames for v in three)
         if source.visits < _FEW_VISITS and small and source.visits + candidate.visits:
             found.append(k)
     return frozenset(found)
@@ -238,14 +239,15 @@ def rare_residues(inputs: ComparisonInput) -> frozenset[int]:
 def free_energy_row(inputs: ComparisonInput, k: int, label: str) -> Row:
     """Return the row of the free energy of phi > 0 over phi < 0, in kT, by the time inside. Visits are independent and
     their lengths exponential: of n visits the logarithm has the error sqrt(2 / n); of none the free energy is that of
-    half a visit. The p-value is of the free energies, or of the visits if that is less (exact: which trajectory a visit
-    falls into is a matter of their lengths), in either case doubled."""
+    half a visit, no longer than the trajectory. The p-value is of the free energies, or of the visits if that is less
+    (exact: which trajectory a visit falls into is a matter of their lengths), in either case doubled."""
     found = list(map(visits_of, inputs.column("phi", k)))
     reference, candidate, replicate = found
     of_all = reference + candidate + replicate
     length = of_all.inside / of_all.visits
-    shares = [(v.inside if v.visits else 0.5 * length) / v.n_frames for v in found]
-    values = [math.log((1.0 - p) / p) if p < 1.0 else -math.log(v.n_frames) for p, v in zip(shares, found, strict=True)]
+    half = [0.5 * min(length, v.n_frames) for v in found]
+    shares = [v.inside / v.n_frames if v.visits else h / (v.n_frames + h) for v, h in zip(found, half, strict=True)]
+    values = [math.log((1.0 - p) / p) for p in shares]
     errors = [math.sqrt(2.0 / max(v.visits, 0.5)) for v in found]
     normal = np.random.default_rng([inputs.options.seed, k]).normal(size=(3, _DRAWS))
     n = candidate.visits
@@ -285,7 +287,7 @@ def without_positive_phi(counts: FloatArray, n_bins: int) -> FloatArray:
 
 def other_torsion_rows(inputs: ComparisonInput) -> Measured:
     """Return Jensen-Shannon distances of every torsion beside phi and psi, 100 bins, symmetric rotors folded: chi and
-    rotatable bonds have a row each (one for all above six), omega and rotors one for all of them."""
+    rotatable bonds have a row each (one for all above six), omega, rotors and rings one for all of them."""
     probes = inputs.probes
     rows: list[Row] = []
     charts: list[Chart] = []
@@ -378,21 +380,22 @@ def step_rows(inputs: ComparisonInput) -> Measured:
     the states of the slowest motion as often as the reference; a wrong time between frames shows here first. Only
     states that all three hold count: what one run alone has met, and steps in otherwise, is no wrong time."""
     if not (len(inputs.torsions.phi) or len(inputs.torsions.psi) or slow_torsions(inputs.reference.features)):
-        return left_out("Steps of torsions from frame to frame", "the scene has no torsion to turn about")
+        return left_out("Steps of torsions from frame to frame", "no rotatable torsion")
     # NaN after the last frame.
     squared = [[np.append(squared_turn(x), np.nan)[: len(x)] for x in _angles(s.features)] for s in inputs.samples]
     states = [
         [np.where((x >= 0) & (y >= 0), _N_STATES * x + y, -1) for x, y in zip(own, apart, strict=True)]
         for own, apart in zip(slow_states(inputs), _states_apart(inputs), strict=True)
     ]
-    fine = with_own_blocks(inputs, residuals(squared, states))
     flat = [np.concatenate(list(own)) for own in states]
     n_states = max(int(x.max(initial=0)) for x in flat) + 1
-    frames = [np.bincount(x[x >= 0], minlength=n_states) for x in flat]
+    known = [(x >= 0) & np.isfinite(np.concatenate(own)) for x, own in zip(flat, squared, strict=True)]
+    frames = [np.bincount(x[k], minlength=n_states) for x, k in zip(flat, known, strict=True)]
     shared = np.all([n >= _LEAST_IN_STATE * max(int(n.sum()), 1) for n in frames], axis=0)
-    share = np.asarray(frames[0] + frames[2], dtype=np.float64)
-    if shared.any():
-        share[~shared] = 0.0
+    if not shared.any():
+        return left_out("Steps of torsions from frame to frame", "the three trajectories share no state")
+    share = np.where(shared, frames[0] + frames[2], 0.0)
+    fine = with_own_blocks(inputs, residuals(squared, states))
     values, draws = [], []
     for sample, steps, of in zip(fine.samples, squared, states, strict=True):
         total, count = np.zeros((2, sample.blocks.n_blocks, n_states))
@@ -495,7 +498,7 @@ def _in_quarters(
     edges: Callable[[FloatArray], FloatArray],
 ) -> States:
     """Fit TICA to `fitted`, and put every frame of `features` between the `edges` of its values there."""
-    lag = max(1, round(_TICA_LAG_PS / inputs.lag_ps))
+    lag = kinetics.tica_lag(inputs.lag_ps)
     model = kinetics.fit_projection(fitted, lag, 1) if max(map(len, fitted)) > 10 * lag else None
     if model is None:
         return [[np.zeros(n, dtype=np.int64) for n in s.features.segment_lengths] for s in inputs.samples]

@@ -127,9 +127,10 @@ def _share_row(inputs: ComparisonInput, check: Check, key: str) -> Row:
     )
 
 
-def frame_keys(features: Features) -> npt.NDArray[np.void] | None:
+def frame_keys(features: Features, k: int = 0) -> npt.NDArray[np.void] | None:
     """Return a number per frame `(n,)` that copies share, whatever was rotated, shifted or converted in between: a few
-    angles on a grid of 0.06°; None where there are fewer than three. NaN frames are no copies of each other."""
+    angles on a grid of 0.06°; None where there are fewer than three. NaN frames are no copies of each other, nor
+    of those of trajectories of another `k`."""
     families = [features.series[f] for f in ("angles", "torsions")] if features.series else []
     columns = [np.concatenate(list(v)) for v in (features.phi, features.psi, *families)]
     every = np.concatenate(columns, axis=1)
@@ -138,7 +139,7 @@ def frame_keys(features: Features) -> npt.NDArray[np.void] | None:
     chosen = np.unique(np.linspace(0, every.shape[1] - 1, _KEY_COLUMNS).astype(int))
     grid = np.round(every[:, chosen].astype(np.float64) / _GRID)
     broken = ~np.isfinite(grid).all(axis=1)
-    grid[broken] = 1e9 + np.arange(int(broken.sum()))[:, None]
+    grid[broken] = 1e9 * (k + 1) + np.arange(int(broken.sum()))[:, None]
     keys = np.ascontiguousarray(grid.astype(np.int64))
     return keys.view(np.dtype((np.void, keys.dtype.itemsize * keys.shape[1])))[:, 0]
 
@@ -151,7 +152,7 @@ def copy_rows(inputs: ComparisonInput) -> Measured:
         return left_out(name, "fewer than three angles tell frames apart")
     shares = [1.0 - len(np.unique(k)) / len(k) for k in keys]
     if max(shares) < _NAMED_SHARE:
-        return left_out(name, "there are none")
+        return left_out(name, "fewer than one frame in a hundred is one")
     percent = [Estimate(100.0 * x, n_blocks=s.blocks.n_blocks) for x, s in zip(shares, inputs.samples, strict=True)]
     still = shares[1] > 1.0 - 1.5 / inputs.candidate.features.n_frames
     said = f"{100 * shares[1]:.3g} % of frames are copies of other frames"
@@ -176,7 +177,7 @@ def copy_rows(inputs: ComparisonInput) -> Measured:
 def copied_from(inputs: ComparisonInput) -> tuple[str, list[str]]:
     """Return why there is nothing to evaluate, where most of the candidate's frames are the reference's own; and notes
     on frames that any two of the three have in common."""
-    ref, cand, rep = (frame_keys(s.features) for s in inputs.samples)
+    ref, cand, rep = (frame_keys(s.features, k) for k, s in enumerate(inputs.samples))
     if ref is None or cand is None or rep is None:
         return "", []
     why, notes = "", []

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any, ClassVar, cast
 
 import torch
@@ -14,7 +15,7 @@ from torch.nn import functional as F
 from surrogate.models import layers
 from surrogate.models.architecture import ModelConfig
 from surrogate.models.lam_slide import flow
-from surrogate.models.propagator import Chunk, Molecule, Propagator
+from surrogate.models.propagator import Chunk, Molecule, Propagator, row_by_row
 from systems.errors import InputError
 
 
@@ -383,10 +384,8 @@ class LamSlide(Propagator):
                    solver: str | None = None, last_velocities_nm_ps: Tensor | None = None) -> Chunk:  # fmt: skip
         """See `Propagator.next_chunk`. Velocities play no part."""
         if solver in flow.ADAPTIVE and len(noise) > 1:
-            pairs = zip(last_frames_nm.split(1), noise.split(1), strict=True)
-            rows = [self.next_chunk(x, molecule, n, solver_steps=solver_steps, solver=solver) for x, n in pairs]
-            mean = sum(row.evaluations or 0.0 for row in rows) / len(rows)
-            return Chunk(torch.cat([row.frames_nm for row in rows]), evaluations=mean)
+            draw = partial(self.next_chunk, solver_steps=solver_steps, solver=solver)
+            return row_by_row(lambda x, own: draw(x, molecule, own), last_frames_nm, noise)
         # Frames that training turned at random, it had about their middle.
         middle_nm = 0.0 if self.config.canonical else last_frames_nm[:, -1:].mean(-2, keepdim=True)
         known = self.encode(last_frames_nm - middle_nm, molecule.elements)

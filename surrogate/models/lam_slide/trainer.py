@@ -31,13 +31,10 @@ TAU_MAX = 0.995
 
 def random_rotations(n: int, generator: torch.Generator) -> Tensor:
     """Return `(n, 3, 3)` rotations, uniform over SO(3): normalised Gaussian quaternions."""
-    w, x, y, z = F.normalize(torch.randn(n, 4, generator=generator), dim=-1).unbind(-1)
-    rows = [
-        1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w),
-        2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w),
-        2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y),
-    ]  # fmt: skip
-    return torch.stack(rows, dim=-1).reshape(n, 3, 3)
+    from scipy.spatial.transform import Rotation
+
+    real_last = torch.randn(n, 4, generator=generator).roll(-1, dims=1)
+    return torch.from_numpy(Rotation.from_quat(real_last.numpy()).as_matrix()).float()
 
 
 def pair_distances(x: Tensor) -> Tensor:

@@ -234,11 +234,11 @@ class EdgeWeights(NamedTuple):
 
 
 class Surroundings(nn.ModuleList):
-    """Embeddings of elements -> embeddings of elements in their surroundings, as far as there are rounds."""
+    """Embeddings of elements -> embeddings of elements in their surroundings, up to three bonds away."""
 
-    def __init__(self, width: int, n_rounds: int = 3) -> None:
+    def __init__(self, width: int) -> None:
         super().__init__(
-            nn.Sequential(nn.Linear(2 * width, width), nn.SiLU(), nn.Linear(width, width)) for _ in range(n_rounds)
+            nn.Sequential(nn.Linear(2 * width, width), nn.SiLU(), nn.Linear(width, width)) for _ in range(3)
         )
 
     def forward(self, of_element: Tensor, bonds: Tensor) -> Tensor:

@@ -6,7 +6,7 @@ import itertools
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
-from itertools import product
+from itertools import islice, product
 
 import networkx as nx
 import numpy as np
@@ -27,7 +27,9 @@ from systems.scene import Scene
 
 # Forms of a residue that differ in hydrogens alone, the commonest at pH 7 first.
 _FORMS = {"HIS": ("HIE", "HID", "HIP"), "ASP": ("ASP", "ASH"), "GLU": ("GLU", "GLH"), "LYS": ("LYS", "LYN")}
-# Hydrogens of a whole peptide tell most forms apart; of what is left, so many are tried.
+# Hydrogens that a form has more than its residue's commonest.
+_EXTRA_H = {"HIP": 1, "ASH": 1, "GLH": 1, "LYN": -1}
+# Hydrogens of residues tell most forms apart; of what is left, so many are tried.
 _MOST_TRIED = 8
 
 
@@ -42,25 +44,33 @@ def standard_peptide(scene: Scene) -> tuple[Scene, npt.NDArray[np.int64]]:
     names = [template.name if (template := template_for(name)) else name for name in scene.residue_names]
     if not any(map(template_for, scene.residue_names)):
         raise InputError(f"{scene.name} is no chain of amino acids.")
-    hydrogens = sum(element == "H" for element in scene.elements)
-    refusal = ""
-    for forms in list(product(*(_FORMS.get(name, (name,)) for name in names)))[:_MOST_TRIED]:
+    choices, refusal = [_FORMS.get(name, (name,)) for name in names], ""
+    try:
+        usual = build_peptide("-".join(forms[0] for forms in choices))
+        extra = _hydrogens(scene) - _hydrogens(usual)
+        choices = [
+            tuple(form for form in forms if _EXTRA_H.get(form, 0) == n)
+            for forms, n in zip(choices, extra.tolist(), strict=True)
+        ]
+    except PreparationError as error:
+        choices, refusal = [], str(error)
+    for forms in islice(product(*choices) if choices else (), _MOST_TRIED):
         try:
             built = build_peptide("-".join(forms))
-        except PreparationError as error:
-            refusal = refusal or str(error)
-            continue
-        if sum(element == "H" for element in built.elements) != hydrogens:
-            continue
-        try:
             order = match_atoms(scene, built)
-        except OutOfDomainError as error:
+        except (PreparationError, OutOfDomainError) as error:
             refusal = str(error)
             continue
         return built.with_positions(scene.positions_nm[order]), order
     raise InputError(
         f"{scene.name} is no chain of standard residues with usual ends: {refusal or 'its hydrogens fit no usual form'}"
     )
+
+
+def _hydrogens(scene: Scene) -> npt.NDArray[np.int64]:
+    """Return the number of hydrogens of each residue, `(n_residues,)`."""
+    is_hydrogen = np.array(scene.elements) == "H"
+    return np.bincount(scene.residue_of_atom[is_hydrogen], minlength=len(scene.residue_names))
 
 
 # Of the nearest that atoms of two classes come in MD: where frames are mended or drawn again.

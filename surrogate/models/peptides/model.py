@@ -12,6 +12,7 @@ overlap, are mended by small turns; chunks with frames where that is not enough 
 from __future__ import annotations
 
 import math
+from functools import partial
 from typing import ClassVar, NamedTuple, cast
 
 import torch
@@ -22,7 +23,7 @@ from surrogate.models.lam_slide import flow
 from surrogate.models.layers import ParallelBlock, TimeEmbedding, rotary_angles
 from surrogate.models.peptides.chains import MOST_STATES, MOST_TORSIONS, ChainFeatures, conditioning_states, mended
 from surrogate.models.peptides.layout import ENDS, PeptideConfig, chain_features
-from surrogate.models.propagator import Chunk, Molecule, Propagator
+from surrogate.models.propagator import Chunk, Molecule, Propagator, row_by_row
 from systems.chemistry.geometry import superpose
 from systems.errors import InputError
 from systems.scene import Scene
@@ -377,10 +378,6 @@ class PeptideSlide(Propagator):
             found = torch.where(own == state, mean[:, state], found)
         return found
 
-    def frames_of(self, numbers: Tensor, states: Tensor, chain: ChainFeatures) -> Tensor:
-        """The inverse of `normalised`, each frame laid on the template by heavy atoms."""
-        return self._laid(chain.code.decode(self._tokens(numbers, states, chain)), chain)
-
     def _tokens(self, numbers: Tensor, states: Tensor, chain: ChainFeatures) -> Tensor:
         return numbers.float() * self.token_scale[chain.places[:, 0]] + self.middle(states, chain)
 
@@ -422,6 +419,10 @@ class PeptideSlide(Propagator):
         chain: ChainFeatures | None = molecule.own
         if chain is None:
             raise InputError("this model knows peptides by residues; make molecules by its `featurise`.")
+        solver = solver or self.solvers[0]
+        if solver in flow.ADAPTIVE and len(noise) > 1:
+            draw = partial(self.next_chunk, solver_steps=solver_steps, solver=solver)
+            return row_by_row(lambda x, own: draw(x, molecule, own), last_frames_nm, noise)
         types, filled = chain.places[:, 0], chain.code.filled
         observed, now = self.normalised(last_frames_nm[:, -1], chain)
         assert self.lag_ps is not None
@@ -451,7 +452,7 @@ class PeptideSlide(Propagator):
                 evaluations += len(rows) / len(observed)
                 return torch.where(filled, self.flow(o, tau, conditioning), 0.0)
 
-            y = flow.SOLVERS[solver or self.solvers[0]](predict, drawn, solver_steps)
+            y = flow.SOLVERS[solver](predict, drawn, solver_steps)
             tokens = self._tokens(self.from_innovations(y, observed[rows], times[rows], types), states[rows], chain)
             resolved = mended(tokens.flatten(0, 1), states[rows].flatten(0, 1), chain)
             frames, astray, crowded = (x.unflatten(0, tokens.shape[:2]) for x in resolved)

@@ -140,7 +140,7 @@ def _by_simd(rates: Rates, scene: Scene, config: MDConfig) -> Rates:
     except SimulationError as error:
         if asked_for:
             raise
-        return replace(rates, without_simd=str(error).removesuffix("; take another platform."))
+        return replace(rates, without_simd=str(error).removesuffix("; use another platform."))
     assert plan.us_per_step is not None
     ps_per_s = rates.cores * config.timestep_ps / (plan.us_per_step * 1e-6) / rates.stretch
     if ps_per_s <= rates.md_ps_per_s and not asked_for:

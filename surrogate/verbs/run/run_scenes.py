@@ -291,7 +291,7 @@ def _result(spec: SceneSpec, folder: Path, failed: str) -> dict[str, Any]:
     line |= {"formula": record["formula"], "way": decision["way"] if decision else "", "wall_s": record["spent_s"]}
     if outcome is None:
         return line | {"failed": failed or "not done"}
-    return line | {key: value for key, value in outcome.items() if key != "notes"}
+    return line | outcome
 
 
 def write_results(folder: Path, results: list[dict[str, Any]]) -> None:
@@ -321,7 +321,7 @@ def _row(result: dict[str, Any]) -> str:
         format_time_ps(result["held_out_ps"], 2),
         result["equivalent_time"] or "-",
         "" if result["speed_up"] is None else f"{result['speed_up']:.2g}",
-        result["verdict"],
+        "; ".join([result["verdict"], *result["notes"]]),
         format_wall(result["wall_s"]),
     )
     columns = "".join(f'<td data-label="{head}">{escape(cell)}</td>' for head, cell in zip(_HEADS[1:], cells))

@@ -499,7 +499,8 @@ def _report(site: Site, record: RunRecord) -> RunRecord:
         raise InputError(f"{lacking} came to nothing in its time; `resume=True` with a longer `budget_s` goes on.")
     answer = answer_of(site, record)
     held, rolled = ([site.folder / file for file in files] for files in (record.held_out, record.trajectory))
-    notes = tuple(f"{entry.name}: {entry.note}" for entry in record.stages if entry.note)
+    repairs = tuple(site.scene.provenance.get("repairs", ()))
+    notes = (*repairs, *(f"{entry.name}: {entry.note}" for entry in record.stages if entry.note))
     label = "MD" if decision.way == "md" else "surrogate"
     comparison = None
     if held:
@@ -531,7 +532,7 @@ def _report(site: Site, record: RunRecord) -> RunRecord:
         foreword=Foreword(
             "\n".join(found.in_short),
             "States, equivalent MD time, and how the budget was spent",
-            [("equivalent_time", found.details), *lines, *(("note", note) for note in notes)],
+            [("equivalent MD time", found.details), *lines, *(("note", note) for note in notes)],
             [] if answer is None else weighted_maps(answer.maps),
         ),
     )

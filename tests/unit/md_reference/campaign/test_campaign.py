@@ -198,7 +198,7 @@ def test_two_processes_cannot_run_one_campaign(client: Any, tmp_path: Path) -> N
             refused.append(str(caught.value))
             signal.raise_signal(signal.SIGINT)
 
-    with pytest.raises(KeyboardInterrupt, match=r"of 4 runs .* the same command goes on"):
+    with pytest.raises(KeyboardInterrupt, match=r"of 4 runs .* run the same command to continue"):
         run_campaign(campaign, client, progress=second)
     assert refused
 

@@ -7,16 +7,18 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from openmm import NonbondedForce
 
 from md_reference.forces.forcefield import build_system
 from md_reference.forces.mixture import permuted, regroup
-from md_reference.forces.spec import ForceFieldSpec
+from md_reference.forces.solvation import solvate
+from md_reference.forces.spec import ForceFieldSpec, WaterBox
 from md_reference.run.config import Conditions
 from md_reference.run.engine import Engine
 from md_reference.run.simulate import MDConfig, simulate
 from systems.errors import PreparationError
 from systems.library.named_scenes import prepare
-from systems.scene import IntArray, Scene, reordered
+from systems.scene import IntArray, Scene, part_of, reordered
 from systems.trajectory.codec import open_trajectory
 from systems.trajectory.companion_writer import pdb_text
 
@@ -26,6 +28,20 @@ SPECS = {
     "amber99-obc": ForceFieldSpec("ff99SB-ILDN", "amber99-obc"),
     "vacuum": ForceFieldSpec(solvent="vacuum", constrain_hydrogens=False),
 }
+
+
+@pytest.mark.parametrize("solvent", ["obc2", "tip3p", "opc"])
+def test_ff99sb_ildn_takes_the_ions_of_its_water(solvent: str) -> None:
+    spec = ForceFieldSpec("ff99SB-ILDN", solvent)
+    wet = ForceFieldSpec("ff14SB", "tip3p") if solvent == "obc2" else spec
+    scene = solvate(prepare("ACE-GLY-NME"), wet, WaterBox(ionic_strength_molar=0.15))
+    if solvent == "obc2":
+        is_ion = np.isin(scene.elements, ["Na", "Cl"])
+        scene = replace(part_of(scene, np.flatnonzero(is_ion | (np.arange(scene.n_atoms) < 19))), cell_nm=None)
+    system = build_system(scene, spec)
+    force = next(f for f in system.getForces() if isinstance(f, NonbondedForce))
+    charges = [force.getParticleParameters(k)[0]._value for k in range(system.getNumParticles())]
+    assert sum(charges) == pytest.approx(scene.formal_charges.sum(), abs=1e-6)
 
 
 def shuffled(scene: Scene, order: IntArray) -> Scene:

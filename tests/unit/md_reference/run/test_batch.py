@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+import signal
 from dataclasses import replace
 from pathlib import Path
 
@@ -69,6 +70,25 @@ def test_what_was_stopped_goes_on_as_if_it_had_not_been(tmp_path: Path, monkeypa
         simulate_batch(SCENE, CONFIG, parts, resume=True)
 
 
+def test_a_long_frame_is_stopped_within_and_the_same(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    config = replace(CONFIG, save_every_ps=6.0, time_ps=12.0)
+    simulate_batch(SCENE, replace(config, save_every_ps=2.0), [tmp_path / "w.h5"])
+    steps, count = replicas.SimdReplicas.step, []
+
+    def interrupted(self: replicas.SimdReplicas, n: int) -> None:
+        steps(self, n)
+        count.append(n)
+        if len(count) == 6:  # one of equilibration, three of a frame
+            signal.raise_signal(signal.SIGINT)
+
+    monkeypatch.setattr(replicas.SimdReplicas, "step", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        simulate_batch(SCENE, config, [tmp_path / "p.h5"])
+    assert len(count) == 6 and len(_frames(tmp_path / "p.h5")) == 1
+    simulate_batch(SCENE, config, [tmp_path / "p.h5"], resume=True)
+    assert np.array_equal(_frames(tmp_path / "p.h5"), _frames(tmp_path / "w.h5")[2::3])
+
+
 def test_a_replica_that_blows_up_leaves_the_frames_before(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     steps = replicas.SimdReplicas.step
     count = []
@@ -89,9 +109,30 @@ def test_a_replica_that_blows_up_leaves_the_frames_before(tmp_path: Path, monkey
 
 @pytest.mark.parametrize("change", [{"ensemble": "nve"}, {"save_velocities": True}])
 def test_what_simd_cannot_do_is_refused(tmp_path: Path, change: dict[str, object]) -> None:
-    with pytest.raises(InputError, match="platform simd"):
-        simulate_batch(SCENE, replace(CONFIG, **change), [tmp_path / "x.h5"])
+    config: MDConfig = replace(CONFIG, **change)  # type: ignore[arg-type]
+    with pytest.raises(InputError, match="platform simd supports only nvt"):
+        simulate_batch(SCENE, config, [tmp_path / "x.h5"])
+    with pytest.raises(InputError, match="platform simd supports only nvt"):
+        make_plan(SCENE, config, timed=False)
     assert not list(tmp_path.iterdir())
+
+
+def test_terms_that_simd_does_not_have_are_refused_before_any_md(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(replicas, "many_starts", lambda *_: pytest.fail("hot MD was begun"))
+    config = replace(CONFIG, force=ForceFieldSpec("ff14SB", "gbn2"))
+    with pytest.raises(SimulationError, match="does not support CustomGBForce"):
+        simulate_replicas(SCENE, config, [tmp_path / "a.h5", tmp_path / "b.h5"])
+
+
+def test_replicas_are_counted_across_batches(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(replicas, "n_replicas", lambda: 2)
+    outs = [tmp_path / f"{k}.h5" for k in range(3)]
+    simulate_replicas(SCENE, replace(CONFIG, time_ps=1.0, starts="one"), outs)
+    with open_trajectory(outs[2]) as reader:
+        record = reader.record
+    assert (record["replica"], record["of_replicas"], record["batch"], record["seed"]) == (2, 3, [0, 1], 6)
 
 
 def test_the_plan_counts_replicas_that_run_at_once() -> None:

@@ -54,6 +54,8 @@ def test_an_unknown_ensemble_is_refused_with_the_nearest(alanine_dipeptide: Scen
         simulate(alanine_dipeptide, replace(SHORT, ensemble="nptt"), tmp_path / "a.h5")
     with pytest.raises(InputError, match="no periodic cell"):
         simulate(alanine_dipeptide, replace(SHORT, ensemble="NPT"), tmp_path / "a.h5")
+    with pytest.raises(InputError, match="nve is not available with OPC"):
+        simulate(alanine_dipeptide, replace(FINE, force=ForceFieldSpec("ff19SB", "opc")), tmp_path / "a.h5")
     assert not list(tmp_path.iterdir())
 
 

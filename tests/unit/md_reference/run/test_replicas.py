@@ -8,7 +8,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -134,6 +134,32 @@ def being_written(path: Path, scene: Scene) -> bool:
 def frames_in(path: Path) -> int:
     with open_trajectory(path) as reader:
         return reader.n_frames
+
+
+@pytest.mark.skipif(not Path("/proc").is_dir(), reason="looks for processes in /proc")
+def test_ctrl_c_while_replicas_start_is_quiet(tmp_path: Path, repository: Path) -> None:
+    outs = [str(tmp_path / "a.h5"), str(tmp_path / "b.h5")]
+    (tmp_path / "parent.py").write_text(PARENT.format(repository=str(repository), outs=outs))
+    command = [sys.executable, str(tmp_path / "parent.py")]
+    with (
+        subprocess.Popen(command, stderr=subprocess.PIPE, text=True, start_new_session=True) as parent,
+        ended(parent),
+    ):
+        children = Path(f"/proc/{parent.pid}/task/{parent.pid}/children")
+        deadline = time.monotonic() + 300
+        while not any(b"spawn_main" in _command(child) for child in children.read_text().split()):
+            assert parent.poll() is None and time.monotonic() < deadline
+            time.sleep(0.01)
+        time.sleep(0.1)  # Python has begun to import
+        os.killpg(parent.pid, signal.SIGINT)
+        _, said = parent.communicate(timeout=60)
+    assert parent.returncode == 130 and "Traceback" not in said
+
+
+def _command(process: str) -> bytes:
+    with suppress(OSError):
+        return Path(f"/proc/{process}/cmdline").read_bytes()
+    return b""
 
 
 @pytest.mark.skipif(os.name != "posix", reason="sends SIGKILL")

@@ -125,7 +125,7 @@ def test_clashing_atoms_are_minimised_and_said(tmp_path: Path) -> None:
     (tmp_path / "in.pdb").write_bytes(topology_bytes(scene))
     read = prepare(tmp_path / "in.pdb")
     said = " ".join(read.provenance["repairs"])
-    assert "ACE A1 C and ALA A5 O are 0.72 Å apart" in said and "minimising has to part them" in said
+    assert "ACE A1 C and ALA A5 O are 0.72 Å apart" in said and "energy minimisation must separate them" in said
     simulate(read, replace(SHORT, equilibrate_ps=1.0), tmp_path / "a.h5")
     frames = contents(tmp_path / "a.h5")[0]
     flags = check_frames(frames, geometry_from_scene(prepare("sequence:ACE-ALA-ALA-ALA-ALA-NME")))

@@ -10,6 +10,7 @@ import pytest
 
 import md_reference.run.starts as starts
 from md_reference.forces.forcefield import resolve
+from md_reference.forces.mixture import solute_of
 from md_reference.forces.solvation import solvate
 from md_reference.forces.spec import ForceFieldSpec, WaterBox
 from md_reference.run.config import Conditions, MDConfig
@@ -21,7 +22,7 @@ from systems.chemistry.graph import backbone_torsions, rotatable_torsions
 from systems.chemistry.validity import CHIRALITY, OMEGA, check_frames, geometry_from_scene
 from systems.errors import SimulationError
 from systems.library.named_scenes import load
-from systems.scene import Scene
+from systems.scene import Scene, part_of
 from systems.trajectory.codec import open_trajectory
 
 SCENE = load("alanine-dipeptide")
@@ -38,7 +39,7 @@ def angles(scenes: tuple[Scene, ...]) -> np.ndarray:
 def test_starts_are_many_states_of_the_same_molecule() -> None:
     scenes, how = many_starts(SCENE, conditions(), 20)
     positions = np.stack([s.positions_nm for s in scenes])
-    assert len(scenes) == 20 and "20 starts" in how
+    assert len(scenes) == 20 and "20 starting structures" in how
     assert not (check_frames(positions, geometry_from_scene(SCENE)) & (CHIRALITY | OMEGA)).any()
     psi = np.degrees(torsion(positions, np.asarray(backbone_torsions(SCENE)["psi"])))[:, 0]
     helical = (psi > -120) & (psi < 80)
@@ -91,7 +92,7 @@ def test_what_cannot_turn_begins_in_one_structure() -> None:
 
     methane = prepare("smiles:C")
     scenes, how = many_starts(methane, conditions(methane), 3)
-    assert "one structure" in how and "no torsion" in how
+    assert "from the input structure" in how and "no rotatable torsions" in how
     assert all(s is methane for s in scenes)
 
 
@@ -109,11 +110,20 @@ def test_in_water_little_time_is_for_turning_where_little_is_for_being_hot(monke
     assert asked == [4.0, 10.0]
 
 
+def test_at_constant_pressure_and_without_a_solute(monkeypatch: pytest.MonkeyPatch) -> None:
+    wet = solvate(SCENE, spec := ForceFieldSpec("ff14SB", "tip3p"), WaterBox())
+    npt = Conditions(spec, seed=3, ensemble="npt")
+    monkeypatch.setattr(starts, "_steps", lambda *_: None)
+    assert "(SIMD replicas)" in many_starts(wet, npt, 2)[1]
+    water = part_of(wet, np.setdiff1d(np.arange(wet.n_atoms), solute_of(wet)))
+    assert "nothing but water" in many_starts(water, npt, 2)[1]
+
+
 def test_frames_that_are_another_molecule_are_no_starts() -> None:
     mirrored = SCENE.positions_nm * np.array([-1.0, 1.0, 1.0])
     frames = np.stack([mirrored, SCENE.positions_nm, np.full_like(mirrored, np.nan)])
     scenes, how = frames_as_starts(SCENE, conditions(), frames, 4)
-    assert how.startswith("1 starts") and len(scenes) == 4
+    assert how.startswith("1 starting structure:") and len(scenes) == 4
     with pytest.raises(SimulationError, match="none of 1"):
         frames_as_starts(SCENE, conditions(), mirrored[None], 1)
 
@@ -131,7 +141,8 @@ def test_replicas_begin_apart_unless_one_is_asked_for(tmp_path: Path, platform: 
             with open_trajectory(out) as reader:
                 firsts.append(reader.read(0, 1)[0])
                 assert reader.record["starts"] == starts
+                assert (reader.record.get("starting_structures") in told) == (starts == "many")
         return float(np.cos(torsion(np.array(firsts), rotatable_torsions(SCENE))).std(axis=0).max())
 
     assert spread("many") > 2 * spread("one")
-    assert sum("starts" in line for line in told) == 1
+    assert sum("starting structures" in line for line in told) == 1

@@ -149,7 +149,7 @@ def test_what_it_does_not_know_is_refused(monkeypatch: pytest.MonkeyPatch) -> No
         _replicas(system)
     watery = build_system(build_peptide("ACE-ALA-NME"), ForceFieldSpec("ff14SB", "vacuum"))
     next(f for f in watery.getForces() if isinstance(f, openmm.NonbondedForce)).setNonbondedMethod(1)
-    with pytest.raises(SimdUnavailableError, match="NonbondedForce with a cutoff but without a cell; take another"):
+    with pytest.raises(SimdUnavailableError, match="NonbondedForce with a cutoff but without a cell; use another"):
         _replicas(watery)
     monkeypatch.setattr("systems.files.native.shutil.which", lambda _: None)
     with pytest.raises(SimdUnavailableError, match="which platform simd needs"):

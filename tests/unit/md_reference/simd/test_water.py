@@ -21,7 +21,7 @@ from md_reference.run.config import MDConfig
 from md_reference.run.replicas import simulate_batch
 from md_reference.simd import force_field
 from md_reference.simd.force_field import SimdReplicas
-from md_reference.simd.system_terms import SimdUnavailableError
+from md_reference.simd.system_terms import SimdUnavailableError, _within_solute
 from systems.errors import InputError, SimulationError, UnknownNameError
 from systems.library.named_scenes import prepare
 from systems.scene import FloatArray, Scene
@@ -39,6 +39,13 @@ def wet(name: str, ionic_strength_molar: float = 0.0, padding_nm: float = 1.0) -
     box = WaterBox(padding_nm=padding_nm, ionic_strength_molar=ionic_strength_molar)
     scene = solvate(dry, resolve(dry, TIP3P), box, seed=2)
     return scene, build_system(scene, TIP3P)
+
+
+def test_exceptions_between_waters_are_refused() -> None:
+    force, row = openmm.NonbondedForce(), np.ones(8)
+    force.addException(4, 5, 0.0, 1.0, 0.0)  # the last of one water and the first of the next, after two other atoms
+    with pytest.raises(SimdUnavailableError, match="exceptions between molecules of water"):
+        _within_solute(force, np.arange(8), row, row, row, 2, row)
 
 
 def replicas(system: Any, **how: Any) -> SimdReplicas:
@@ -264,7 +271,7 @@ def test_what_it_does_not_know_is_refused() -> None:
     with pytest.raises(SimdUnavailableError, match="virtual sites"):
         replicas(build_system(solvate(prepare("alanine-dipeptide"), opc, WaterBox()), opc))
     charmm = ForceFieldSpec("charmm36", "tip3p")
-    with pytest.raises(SimdUnavailableError, match="knows no"):
+    with pytest.raises(SimdUnavailableError, match="does not support"):
         replicas(build_system(solvate(prepare("alanine-dipeptide"), charmm, WaterBox()), charmm))
 
 

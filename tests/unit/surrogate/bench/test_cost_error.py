@@ -31,6 +31,7 @@ from surrogate.bench.cost_error import (
     slowest_torsion,
 )
 from surrogate.cli import main
+from surrogate.data import collect_frames
 from surrogate.models.architecture import weights_path
 from surrogate.models.weights import Weights, load_weights, save_weights
 from surrogate.verbs.options import CostErrorConfig, Sweep
@@ -136,6 +137,18 @@ def test_runs_that_were_trained_on_are_refused(
     known = replace(weights, provenance={"sources": [{"file": "b.h5", "sha256": prints[1]}]})
     with pytest.raises(InputError, match=r"then called b\.h5"):
         refuse_trained_on(known, [first], [second])
+    # The same frames, laid on another file's; and the same run, though the weights know other molecules, too.
+    (source,) = collect_frames([second]).sources
+    several = replace(weights.domain, further=(weights.domain,))
+    for kept, domain in (
+        ({"shape_sha256": source["shape_sha256"]}, weights.domain),
+        ({"seed": source["seed"], "topology": source["topology"]}, several),
+    ):
+        known = replace(weights, domain=domain, provenance={"sources": [{"file": "b.h5", **kept}]})
+        with pytest.raises(InputError, match=r"then called b\.h5"):
+            refuse_trained_on(known, [first], [second])
+    other = {"file": "b.h5", "seed": source["seed"], "topology": "another"}
+    assert refuse_trained_on(replace(known, provenance={"sources": [other]}), [first], [second])
     copy = write(tmp_path / "copy.h5", alanine_dipeptide, toy_frames(alanine_dipeptide, 0)[1_000:2_000], seed=99)
     with pytest.raises(InputError, match="share motion"):
         refuse_trained_on(weights, [first], [copy])

@@ -14,6 +14,7 @@ from surrogate.bench.stress import (
     markdown,
     measure_bonds,
     measure_drift,
+    measure_length,
     measure_odd_inputs,
     measure_openmm,
     measure_validity,
@@ -95,9 +96,21 @@ def test_a_whole_stress_test_writes_its_tables(tmp_path: Path, small_weights: We
     assert "## Long rollouts" in text and "chunks helped" in text and text == markdown(result)
     other = replace(small_weights, hash="another")
     (row,) = stress(other, tmp_path, replace(options, sections=["length"]))["sections"]["length"]
-    assert "complete, but of weights_hash" in row["outcome"], "rollouts of other weights are not taken for its own"
+    assert "started with weights_hash" in row["outcome"], "rollouts of other weights are not taken for its own"
+    with (
+        pytest.raises(InputError, match="do not say their force_field"),
+        openmm_of(replace(small_weights.domain, conditions={"solvent": "obc2", "temperature_k": 300.0}), 0.001, 0),
+    ):
+        pass
     with pytest.raises(InputError, match="ten frames"):
         stress(small_weights, tmp_path, StressOptions(frames=[100], replicas=16))
+
+
+def test_a_rollout_that_was_stopped_is_measured_again(tmp_path: Path, small_weights: Weights) -> None:
+    """By the guard of a model that a second's training leaves wrong."""
+    rows = [measure_length(small_weights, tmp_path, 40, replicas=2, guard="flag") for _ in range(2)]
+    assert "replica" in rows[0].pop("outcome") and "stopped by the guards" in rows[1].pop("outcome")
+    assert rows[0] == rows[1] and rows[0]["frames"] > 0
 
 
 @pytest.mark.parametrize("rigid", [True, False])

@@ -82,3 +82,15 @@ def test_a_third_party_s_metric_counts_by_its_kind_and_time_scale(
     assert any(c.title == "Made up" for c in found.charts if isinstance(c, LineChart))
     assert ("it is off" in found.findings) == seen
     assert (found.status == "different") == seen, found.verdict
+
+
+def test_what_was_not_tested_is_not_right_and_other_conditions_are_named(ensembles: list[Ensemble]) -> None:
+    copied = compare(ensembles[0], [ensembles[0]], ensembles[2], options=OPTIONS).evaluations[0]
+    assert copied.in_short[1].startswith("Right: nothing that could be tested."), copied.in_short
+    hot = replace(ensembles[1], record={"temperature_k": 330.0}, label="hot")
+    notes = compare(replace(ensembles[0], record={"temperature_k": 300.0}), [hot], ensembles[2], options=OPTIONS).notes
+    assert any("hot was made at another temperature in K than the reference: 330.0, not 300.0" in n for n in notes)
+    short = [replace(e, segments=[s[:300] for s in e.segments]) for e in ensembles]
+    few = evaluated(short)
+    right = few.in_short[1].partition("Not known")[0]
+    assert "single structures" in right and "distributions" not in right, few.in_short

@@ -38,6 +38,9 @@ def test_lengths_are_made_equal(simulate: Callable[..., Ensemble], inputs: Compa
     evaluation = compare(reference, [short], replicate).evaluations[0]
     assert evaluation.n_frames == 3_000 and evaluation.compared_ps == 3_000.0
     assert sum("at equal length; all of it for the tests" in n for n in evaluation.notes) == 2
+    found = compare(reference, [simulate(9, 300)], replicate)
+    assert sum("the first 6 ns for the tests" in n for n in found.evaluations[0].notes) == 2
+    assert found.options.n_permutations == 50 * 76, "as many as were used"
 
 
 def test_intervals_that_differ_are_thinned_to_a_common_one(inputs: ComparisonInput) -> None:
@@ -63,8 +66,9 @@ def test_an_unvisited_state_is_undecided_not_fine(simulate: Callable[..., Ensemb
     """With 120 frames next to nothing can be known, and the comparison says so."""
     evaluation = compare(simulate(11, 120), [simulate(12, 120)], simulate(13, 120)).evaluations[0]
     assert evaluation.row("population").verdict == "undecided"
-    assert evaluation.status == "undecided" and "too few to compare with" in evaluation.verdict
-    assert f"makes {evaluation.effective_samples:.2g} independent samples" in evaluation.verdict
+    assert evaluation.status == "undecided" and "(20 are needed)" in evaluation.verdict
+    assert f"only {evaluation.effective_samples:.2g} independent samples" in evaluation.verdict
+    assert " metrics are left undecided." in evaluation.verdict
     assert not evaluation.equivalent_time_words
 
 
@@ -100,7 +104,7 @@ def test_a_scene_without_torsions_is_evaluated_by_what_it_has() -> None:
     assert good.status == "indistinguishable"
     assert hot.row("bond_width").verdict == "differs"
     reasons = dict(good.skipped)
-    assert reasons["Torsion distributions, basins, autocorrelation"] == "the scene has no φ or ψ torsion"
+    assert reasons["Backbone torsions φ, ψ and their basins"] == "the scene has no φ or ψ torsion"
     assert reasons["Stereocentres"] == "none among the atoms compared"
     assert any(what.startswith("TICA") for what in reasons)
     assert not any(r.group in ("populations", "kinetics") for r in good.rows)

@@ -68,6 +68,8 @@ def test_length_is_that_of_replicas_and_what_would_tell_is_longer_ones() -> None
     assert found.needed_ps is not None and found.needed_ps > 5 * found.slowest_ps
     blind = evaluated(Setting("never", 8, 10.0, never=True), 3)
     assert blind.needed_ps is None and "began on either side of ψ THR 2, and none crossed" in blind.remedy
+    none = convergence_of([make_set(DRIFTING, 3).frames(0, 10)], TORSIONS)
+    assert none.verdict == "too short to test: no replica has 16 frames." and "longer replicas" in none.remedy
     # Few crossings of an only run leave it open what other starts would give.
     few = evaluated(Setting("few", 1, 4.0), 203)
     assert "starts spread" in few.remedy and "crossed" not in few.remedy
@@ -109,6 +111,9 @@ def test_a_state_that_the_reference_could_not_have_met_is_undecided_and_one_it_m
 
     assert found.converged
     rare, often = (explain([without], candidate(n), TORSIONS, found) for n in (1, 20))  # type: ignore[arg-type]
+    stays = dataclasses.replace(reference, phi=[np.full_like(x, 1.0) for x in phi])
+    (line, *_) = explain([without], stays, TORSIONS, found).why
+    assert "100 % of the candidate" in line and "which began in it, never enters it either" in line
     assert any("never entered" in line for line in rare.why)
     assert often.why == ()
 

@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import math
 
 import numpy as np
 import pytest
 
-from surrogate.comparison import markov
+from surrogate.comparison import convergence, markov
 from surrogate.comparison import md_answer as told
 from surrogate.comparison.markov import equilibrium, with_prior
 from surrogate.comparison.md_answer import Answer, frames_over_states, md_answer
 from surrogate.comparison.measure.torsions import find_torsions
 from surrogate.comparison.read.ensemble import Ensemble
+from surrogate.comparison.report.figures import answer_overview
 from systems.chemistry.graph import backbone_torsions, bonded_graph, turned
 from systems.errors import InputError
 from systems.library.named_scenes import prepare
@@ -180,7 +182,10 @@ def test_a_surrogate_counts_for_less_the_more_md_has_seen(forms: np.ndarray) -> 
 def test_where_md_connects_nothing_the_surrogate_alone_connects(forms: np.ndarray) -> None:
     md = ensemble(forms, np.repeat([[0], [0], [1], [2]] * 4, 60, axis=1))
     alone, joint = (md_answer(md, 300.0, surrogate=s) for s in (None, rolled(forms, MATRIX)))
-    assert alone.missing and alone.in_short[0].startswith("Do not use")
+    assert alone.in_short[0].startswith("Do not use")
+    assert alone.missing == tuple(f"not connected: ALA 2 {state} was only begun in (4 of 16 replicas)"
+                                  for state in ("β", "left-handed"))  # fmt: skip
+    assert len(answer_overview("x", joint.to_dict()).axes[0].get_yticks()) == 3
     assert joint.is_joint and joint.missing and "For 3 states" in joint.in_short[1]
     for s, p in zip(joint.states, POPULATIONS, strict=True):
         assert abs(s.share - p) < 3.0 * s.error + 0.05 and s.is_known
@@ -280,6 +285,13 @@ def test_all_frames_tell_by_how_much_those_that_were_asked_are_off(
     assert 0.5 < np.sqrt(np.square(off).mean()) / stated.mean() < 1.7
 
 
+def test_a_replica_of_one_frame_counts_as_one_frame(forms: np.ndarray) -> None:
+    md = ensemble(forms, jumps(MATRIX, [0, 1, 2, 0] * 4, 300, 3))
+    answer = md_answer(dataclasses.replace(md, segments=[md.segments[0][:1], *md.segments[1:]]), 300.0)
+    assert [len(w) for w in answer.weights] == [1, *[300] * 15] and answer.n_replicas == 16
+    assert off(answer) < 0.1
+
+
 def test_weights_make_plain_histograms_right(forms: np.ndarray) -> None:
     states = jumps(MATRIX, [2] * 32, 250, 7)
     answer = md_answer(ensemble(forms, states), 300.0)
@@ -295,9 +307,9 @@ def test_weights_make_plain_histograms_right(forms: np.ndarray) -> None:
 GAUCHE = np.array([[0.94, 0.03, 0.03], [0.1, 0.9, 0.0], [0.1, 0.0, 0.9]])
 
 
-def butane(centres: tuple[float, ...], states: np.ndarray) -> Ensemble:
-    """Butane whose torsion is about the centre, in degrees, of each state."""
-    scene = prepare("smiles:CCCC")
+def butane(centres: tuple[float, ...], states: np.ndarray, smiles: str = "CCCC") -> Ensemble:
+    """Butane, or another molecule with one torsion, which is about the centre, in degrees, of each state."""
+    scene = prepare(f"smiles:{smiles}")
     graph, rng = bonded_graph(scene), np.random.default_rng(0)
     (quad,) = (t.quad for t in find_torsions(scene) if t.kind == "rotatable")
     forms = np.array([[turned(scene.positions_nm, list(quad), math.radians(c + rng.normal(0, 12.0))
@@ -350,6 +362,25 @@ def test_a_molecule_that_is_its_own_mirror_image_has_either_hand_alike(monkeypat
     monkeypatch.setattr(told, "_is_its_mirror_image", lambda scene: False)
     plus, minus = hands(control := md_answer(md, 300.0))
     assert abs(plus - minus) > 0.1 and not control.has_images, "negative control"
+
+
+def test_states_that_no_transitions_connect_are_named_each() -> None:
+    """Anti is only begun in; images of replicas are no replicas."""
+    rng = np.random.default_rng(0)
+    turns = 1 + np.cumsum(rng.random((8, 200)) < 0.1, axis=1) % 2
+    answer = md_answer(butane((180.0, 65.0, -65.0), np.concatenate([np.zeros((4, 200), dtype=int), turns])), 300.0)
+    assert answer.has_images and len(answer.missing) == 1
+    assert "180° was only begun in (4 of 12 replicas)" in answer.missing[0]
+
+
+def test_states_of_a_folded_torsion_are_named_in_its_own_degrees() -> None:
+    """Of biphenyl, whose rings look the same after half a turn."""
+    md = butane((45.0, -45.0), jumps(np.array([[0.95, 0.05], [0.05, 0.95]]), [0, 1], 400, 3), "c1ccccc1-c1ccccc1")
+    names = [s.name.replace("°", "").split(" to ") for s in convergence.tested_reference([md]).states if s.name]
+    assert len(names) == 2
+    for low, high in names:
+        assert (float(high) - float(low)) % 180.0 == pytest.approx(90.0, abs=10.0)
+    assert sorted(int(s.state[:-1]) for s in md_answer(md, 300.0).states) == pytest.approx([-45, 45], abs=6)
 
 
 def test_the_hand_is_that_of_what_turns_most_slowly() -> None:

@@ -60,6 +60,24 @@ def test_a_held_out_system_that_is_trained_on_in_another_order_is_refused(write:
     assert len(sets.trained) == 1 and sets.trained[0].split.held == (1,)
     with pytest.raises(InputError, match="held out for validation and trained on"):
         References((plain,), (plain,)).sets()
+    windows = [path.with_name(f"windows-{path.name}") for path in (plain, again)]
+    for path, one in zip(windows, (plain, again), strict=True):
+        collect_frames([one]).save(path)
+    with pytest.raises(InputError, match="comes in several files, windows among them"):
+        References(tuple(windows)).sets()
+    with pytest.raises(InputError, match="a windows file keeps its own split"):
+        References((windows[0],), (again,)).sets()
+
+
+def test_a_file_has_a_digest_that_does_not_hang_on_those_beside_it(write: Write) -> None:
+    scene = smiles("CCO")
+    first, second = (
+        write(scene, "ethanol"),
+        write(scene.with_positions(scene.positions_nm[:, [1, 2, 0]]), "ethanol-turned-over", seed=5),
+    )
+    alone, beside = collect_frames([second]).sources[0], collect_frames([first, second]).sources
+    assert alone["sha256"] != beside[1]["sha256"] and alone["shape_sha256"] == beside[1]["shape_sha256"]
+    assert beside[0]["shape_sha256"] != beside[1]["shape_sha256"]
 
 
 def test_mixtures_that_no_model_can_learn_are_refused(write: Write) -> None:

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from surrogate import api
+from surrogate import api, data
 from surrogate.data import RUN, Split, TrainingFrames, collect_frames, load_frames
 from surrogate.models.lam_slide.model import LamSlideConfig
 from surrogate.models.lam_slide.trainer import TrainingConfig, train_lam_slide
@@ -117,7 +117,9 @@ def test_training_without_a_cache_of_latents_is_the_same(tmp_path: Path, harmoni
     assert [row["validation_rmsd_nm"] == "" for row in curves[0]] == [False, True]
 
 
-def test_written_windows_equal_collected_frames(tmp_path: Path, alanine_dipeptide: Scene) -> None:
+def test_written_windows_equal_collected_frames(
+    tmp_path: Path, alanine_dipeptide: Scene, monkeypatch: pytest.MonkeyPatch
+) -> None:
     paths = [write(tmp_path / f"{k}.h5", alanine_dipeptide, 30 + k, seed=k) for k in range(3)]
     for canonical in (True, False):
         api.windows(paths, tmp_path / "w.h5", canonical=canonical, overwrite=True)
@@ -125,3 +127,6 @@ def test_written_windows_equal_collected_frames(tmp_path: Path, alanine_dipeptid
         assert np.array_equal(found.coordinates, expected.coordinates)
         assert (found.lag_ps, found.split, found.sources) == (expected.lag_ps, expected.split, expected.sources)
         assert np.array_equal(found.starts, [0, 30, 61, 93])
+    monkeypatch.setattr(data, "QUANTUM_NM", 1e-4)
+    with pytest.raises(InputError, match=r"units of 0\.0002 nm, not 0\.0001"):
+        load_frames(tmp_path / "w.h5")

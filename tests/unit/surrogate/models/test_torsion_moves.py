@@ -10,8 +10,11 @@ import pytest
 import torch
 from torch import Tensor
 
-from surrogate.models.potential import IntegratorConfig, Potential, Turns
+from surrogate.models.architecture import weights_path
+from surrogate.models.potential import IntegratorConfig, Potential, Turns, at_rest
 from surrogate.models.propagator import Molecule, draw_noise
+from surrogate.models.weights import load_weights
+from systems.chemistry.validity import CLASH, check_frames, geometry_from_scene
 from systems.errors import InputError
 from systems.prepare.molecule import scene_from_smiles
 from systems.scene import Scene
@@ -129,6 +132,64 @@ def test_both_sides_of_a_turned_bond_stay_as_they_are_and_move_on_as_they_did() 
 
         grown = torsion(there[row], [a, first, last, b]) - torsion(x[row], [a, first, last, b])
         assert math.remainder(grown - float(angle[row]), 2.0 * math.pi) == pytest.approx(0.0, abs=1e-9)
+
+
+class Flat(Potential):
+    """A potential without forces, which every move is accepted by."""
+
+    arch = "flat"
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.config = IntegratorConfig(torsion_moves=20)
+
+    def energies(self, positions_nm: Tensor, molecule: Molecule) -> Tensor:
+        return 0.0 * positions_nm.sum((1, 2))[:, None]
+
+
+def test_many_moves_leave_the_temperature_and_end_in_no_overlap() -> None:
+    """Where all are accepted but those into overlaps."""
+    scene, model, rows = scene_from_smiles("OCCO"), Flat(), 4000
+    molecule = model.featurise(scene)
+    masses, generator = model.masses_da(molecule)[:, None], torch.Generator().manual_seed(1)
+
+    def drawn(*shape: int) -> Tensor:
+        return torch.randn(rows, scene.n_atoms, *shape, generator=generator, dtype=torch.float64)
+
+    x = torch.tensor(scene.positions_nm).repeat(rows, 1, 1)
+    v = at_rest((KT / masses).sqrt() * drawn(3), masses)
+    draw = drawn(20, 3)
+    there, moving = model._turned(x, v, molecule, masses, draw)
+    kinetic = 0.5 * (masses * moving.square()).sum((1, 2))
+    expected = 0.5 * KT * 3 * (scene.n_atoms - 1)
+    error = float(kinetic.std()) / rows**0.5
+    assert abs(float(kinetic.mean()) - expected) < 3.0 * error < 0.02 * expected
+    assert float((masses * moving).sum(1).abs().max()) < 1e-9
+    unpaired = molecule.own.turns._replace(pairs=torch.zeros(0, 2, dtype=torch.int64), least_nm=torch.zeros(0))
+    free = replace(molecule, own=molecule.own._replace(turns=unpaired))
+    anyhow, _ = model._turned(x, v, free, masses, draw)
+    overlaps = [check_frames(at.numpy(), geometry_from_scene(scene)) & CLASH > 0 for at in (there, anyhow)]
+    assert not overlaps[0].any() and overlaps[1].sum() > 3
+
+
+def test_energies_of_moves_are_those_of_the_frames_that_they_end_in(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Above 64 atoms, where pairs are those of the frames."""
+    model = load_weights(weights_path("drug-like-gfn2-xtb")).model.in_bath({"torsion_moves": 1, "timestep_ps": 0.002})
+    scene = scene_from_smiles("C" * 22)
+    molecule = model.featurise(scene)
+    asked: list[Tensor] = []
+    gradient = model.gradient
+    monkeypatch.setattr(model, "gradient", lambda x, molecule: asked.append(x) or gradient(x, molecule))
+    x, masses = torch.tensor(scene.positions_nm)[None], model.masses_da(molecule)[:, None]
+    draw = torch.randn(1, scene.n_atoms, 2, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    model._turned(x, torch.zeros_like(x), molecule, masses, draw)
+    assert len(asked) == 3 and all(float((at - x).abs().max()) > 0.01 for at in asked[1:])
+
+
+def test_hydrogens_leave_the_atoms_that_bear_them_a_mass() -> None:
+    model = Flat().in_bath({"hydrogen_mass_da": 5.0})
+    with pytest.raises(InputError, match="leaves a heavy atom no mass; use less"):
+        model.masses_da(Molecule.of(scene_from_smiles("C")))
 
 
 def test_moves_without_a_temperature_are_refused() -> None:

@@ -83,14 +83,14 @@ def test_another_protonation_is_another_molecule(small_weights: Weights, alanine
 def test_a_molecule_that_was_trained_on_gets_its_weights() -> None:
     weights, why = choose_weights(load("alanine-dipeptide"))
     assert weights.path.stem == "peptides" and weights.domain.jumps
-    assert "trained on this molecule" in why and "alanine-dipeptide would do, too" in why
+    assert "trained on this molecule" in why and "alanine-dipeptide would also work" in why
 
 
 @pytest.mark.parametrize("sequence", ["ACE-LEU-SER-NME", "GLY-VAL", "ACE-TRP-ARG", "LYS-SER"])
 def test_an_unseen_peptide_gets_the_weights_of_peptides(sequence: str) -> None:
     """Capped or with free ends, or both."""
     weights, why = choose_weights(prepare(f"sequence:{sequence}"))
-    assert weights.path.stem == "peptides" and "without having seen it" in why
+    assert weights.path.stem == "peptides" and "not in their training set" in why
 
 
 @pytest.mark.parametrize("scene", ["smiles:C[Si](C)(C)C", "smiles:CB(O)O", "smiles:CC[O]"])
@@ -102,6 +102,8 @@ def test_a_molecule_that_none_covers_is_refused_with_a_reason(scene: str) -> Non
 def test_another_temperature_is_covered_by_none() -> None:
     with pytest.raises(OutOfDomainError, match="temperature"):
         choose_weights(load("alanine-dipeptide"), temperature_k=350.0)
+    drug = choose_weights(prepare("smiles:CC(=O)Nc1ccc(O)cc1"), temperature_k=350.0)[0]
+    assert drug.path.stem == "paracetamol-gfn2-xtb", "but by a potential"
 
 
 def test_only_the_weights_chosen_are_loaded(monkeypatch: pytest.MonkeyPatch) -> None:

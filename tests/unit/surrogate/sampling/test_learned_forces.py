@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import mdtraj
@@ -19,6 +20,8 @@ from surrogate.models.painet.model import Painet, PainetConfig
 from surrogate.models.painet.painet_potential import PainetPotential
 from surrogate.models.weights import TrainingDomain, Weights, load_weights
 from surrogate.sampling import runner
+from surrogate.sampling.chunks import BLOWN_UP
+from surrogate.sampling.coupling import PotentialChecks
 from surrogate.sampling.domain import in_bath
 from surrogate.sampling.runner import RolloutConfig, rollout
 from surrogate.sampling.simulation import KJ_MOL_PER_EV, LearnedForces
@@ -244,3 +247,25 @@ def test_a_rollout_asks_the_reference_about_its_frames_and_the_comparison_reweig
     assert not (poor & np.uint16(ENERGY)).any()
     (note,) = [note for note in load_ensemble([out]).notes if "Reweighted" in note]
     assert "asked about 12 frames" in note and "of 12 frames are effective" in note
+
+
+def test_energies_of_a_molecule_that_was_not_trained_on_count_from_the_start() -> None:
+    """Their zero is arbitrary."""
+    given = replace(weights(), provenance={"energy_mae": 1.0})
+    limits = {"jump_idx": []}
+    for domain, wrong in ((given.domain, [False, True]), (replace(given.domain, limits=limits), [True, True])):
+        asked = replace(given, domain=domain)
+        learned = LearnedForces(domain.scene, asked)
+        checks = PotentialChecks(asked, SimpleNamespace(energy_kj_mol=lambda x, u=learned: u(x)[0] - 1e5))  # type: ignore[arg-type]
+        frame = domain.scene.positions_nm + 1e-3 * np.arange(domain.scene.n_atoms)[:, None]
+        difference = checks.difference(frame)
+        assert [checks.is_wrong(difference + off) for off in (0.0, 100.0)] == wrong
+
+
+@pytest.mark.parametrize(("reason", "said"), [(BLOWN_UP, "Try a shorter `timestep_ps`"), ("clash", "nothing stops it")])
+def test_what_to_do_fits_why_a_rollout_stopped(reason: str, said: str) -> None:
+    config, sampler = SimpleNamespace(guard="flag"), SimpleNamespace(precision=SimpleNamespace(bf16=False))
+    run: Any = SimpleNamespace(plan=SimpleNamespace(config=config, weights=weights()), sampler=sampler,
+                               outs=[Path("a.h5")], state=SimpleNamespace(steps=0))  # fmt: skip
+    found = runner._Rollout.why_stopped(run, 0, reason)
+    assert said in found and ("timestep" in found) != ("nothing stops it" in found)

@@ -70,11 +70,12 @@ def test_more_atoms_can_be_forced(general: Weights) -> None:
 def test_where_members_disagree_it_is_refused_with_the_spread(tmp_path: Path, alanine: Weights) -> None:
     scene = prepare("smiles:CNC(C)=O")
     strict = saved(tmp_path / "strict.safetensors", alanine, replace(TRUSTED, spread_kj_mol_nm=1.0))
-    with pytest.raises(OutOfDomainError, match=r"forces differ by 1\.\d+ kJ/mol/nm in MD on it; 1 is trusted"):
+    with pytest.raises(OutOfDomainError, match=r"forces differ by 1\.\d+ kJ/mol/nm in short MD; the limit is 1"):
         match_domain(scene, strict)
     (found,) = match_domain(scene, strict, force=True).deviations
     assert found.what == "spread" and found.forcible
-    assert info(strict.path, "smiles:CNC(C)=O")["covered"] == "only with force"
+    said = info(strict.path, "smiles:CNC(C)=O")
+    assert said["covered"] == "only with force" and said["training"] == "never saw this molecule", "nor that they agree"
     # The molecule that it was trained on is never asked.
     assert match_domain(prepare("alanine-dipeptide"), strict).seen
 
@@ -96,10 +97,13 @@ def test_a_molecule_is_asked_once_and_again_where_it_or_the_limit_is_another(
         match_domain(scene, weights)
     match_domain(replace(scene, positions_nm=scene.positions_nm[:, ::-1].copy()), strict)
     assert len(calls) == 3
+    for temperature_k in (300.0, 2000.0, 300.0, 2000.0):
+        match_domain(scene, strict, temperature_k=temperature_k)
+    assert len(calls) == 4, "in another bath, and what was asked in one is kept"
 
 
 def test_a_molecule_that_flies_apart_is_refused(general: Weights) -> None:
-    with pytest.raises(OutOfDomainError, match="spread: 16 of 16 replicas of MD on it do not stay this molecule"):
+    with pytest.raises(OutOfDomainError, match="spread: the molecule breaks or changes in 16 of 16 short test runs"):
         match_domain(prepare("smiles:CCO"), general)
 
 
@@ -115,13 +119,15 @@ def test_a_molecule_on_which_they_agree_is_rolled(
 ) -> None:
     monkeypatch.setattr(coverage, "shipped_weights", lambda: {"general": general.path})
     weights, why = choose_weights(prepare("smiles:CNC(C)=O"), conditions={"force_field": "gfn2-xtb"})
-    assert weights.hash == general.hash and "without having seen it" in why
+    hot, _ = choose_weights(prepare("smiles:CNC(C)=O"), conditions={"force_field": "gfn2-xtb"}, temperature_k=350.0)
+    assert hot.hash == general.hash and hot.model.config.temperature_k == 350.0, "a potential takes any"
+    assert weights.hash == general.hash and "not in their training set" in why
     (out,) = rollout("smiles:CNC(C)=O", general.path, tmp_path / "out.h5", time_ps="2ps", quiet=True)
     with open_trajectory(out) as reader:
         assert reader.n_frames == 20 and not reader.flags.any()
     strict = saved(tmp_path / "strict.safetensors", general, replace(TRUSTED, spread_kj_mol_nm=1.0))
     monkeypatch.setattr(coverage, "shipped_weights", lambda: {"strict": strict.path})
-    with pytest.raises(OutOfDomainError, match=r"no shipped weights cover .*; 1 is trusted"):
+    with pytest.raises(OutOfDomainError, match=r"no shipped weights cover .*; the limit is 1"):
         choose_weights(prepare("smiles:CNC(C)=O"), conditions={"force_field": "gfn2-xtb"})
     with pytest.raises(OutOfDomainError, match="The nearest: strict, where its level is asked for: `level='gfn2-xtb'`"):
         choose_weights(prepare("smiles:CNC(C)=O"))

@@ -19,6 +19,7 @@ from surrogate.models.peptides.trainer import normalise, with_scale
 from surrogate.models.weights import Weights, load_weights, read_header, save_weights, training_domain
 from surrogate.sampling.domain import find_deviations, match_domain
 from surrogate.sampling.runner import RolloutConfig, rollout
+from systems.chemistry.graph import backbone_torsions, bonded_graph, turned
 from systems.errors import InputError, OutOfDomainError, PreparationError
 from systems.prepare.peptide import build_peptide
 from systems.scene import Scene, reordered
@@ -90,8 +91,9 @@ def test_residues_and_ends_without_training_are_refused_for_good(weights: Weight
 def test_a_form_that_the_force_field_lacks_at_an_end_hides_no_other() -> None:
     with pytest.raises(PreparationError, match=r"ff14SB lacks .*LYS"):
         build_peptide("HIE-LYN")
-    standard, _ = standard_peptide(build_peptide("HID-LYS"))
-    assert standard.name == "HID-LYS", "though HIE-LYN is tried before it"
+    for sequence in ("HID-LYS", "ACE-HID-ASP-GLU-LYS-NME", "ACE-HIP-ASH-LYS-HID-ASP-NME"):
+        standard, _ = standard_peptide(as_another_program(build_peptide(sequence)))
+        assert standard.name == sequence, "though others of as many hydrogens, or more, are tried before it"
 
 
 def test_d_residues_are_refused(weights: Weights) -> None:
@@ -107,6 +109,10 @@ def test_longer_and_strained_peptides_roll_when_forced(weights: Weights) -> None
     scene = build_peptide("ACE-SER-ALA-NME")
     strained = scene.with_positions(1.5 * scene.positions_nm)
     assert [d.what for d in find_deviations(strained, weights.domain, model=weights.model)] == ["start"]
+    omega = backbone_torsions(scene)["omega"][1].tolist()
+    cis = scene.with_positions(turned(scene.positions_nm, omega, np.pi, bonded_graph(scene)))
+    found = match_domain(cis, weights, force=True).deviations
+    assert {d.what for d in found} == {"start"} and "peptide bond is cis" in found[-1].reason
 
 
 def test_info_says_how_near_training_comes(weights: Weights) -> None:

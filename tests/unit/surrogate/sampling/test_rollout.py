@@ -91,6 +91,11 @@ def test_an_interrupted_rollout_resumes_bit_for_bit(tmp_path: Path, small_weight
     with pytest.raises(InputError, match="seed"):
         rollout(alanine_dipeptide, small_weights, [cut], replace(CONFIG, seed=5), resume=True)
     assert np.array_equal(roll(alanine_dipeptide, small_weights, cut, resume=True), whole)
+    moved = alanine_dipeptide.with_positions(alanine_dipeptide.positions_nm + 1e-3)
+    for other, asked in ((moved, {}), (alanine_dipeptide, {"solver_steps": 3}), (alanine_dipeptide, {"guard": "flag"})):
+        key = next(iter(asked), "start")
+        with pytest.raises(InputError, match=rf"this rollout was started with {key} = .*, not "):
+            rollout(other, small_weights, [cut], replace(CONFIG, **asked), resume=True)
     # Asked again, a complete rollout is left as it is.
     before = cut.stat().st_mtime_ns
     rollout(alanine_dipeptide, small_weights, [cut], CONFIG, resume=True)
@@ -136,7 +141,7 @@ def test_frames_that_are_not_finite_are_marked_and_stop_the_rollout(tmp_path: Pa
         model.approximator.final.bias.fill_(float("nan"))
     broken = replace(small_weights, model=model.eval().requires_grad_(False))
     out = tmp_path / "a.h5"
-    with pytest.raises(SimulationError, match="no longer finite"):
+    with pytest.raises(SimulationError, match="the coordinates became NaN or infinite"):
         rollout(alanine_dipeptide, broken, [out], CONFIG)
     with open_trajectory(out) as reader:
         assert reader.n_frames == model.n_new

@@ -98,6 +98,8 @@ def test_settings_that_cannot_be_are_refused(domain: TrainingDomain) -> None:
         ({"atoms": "none"}, InputError, "all or heavy"),
         ({"energy_every": -1}, InputError, "at least 0"),
         ({"solver_steps": 0}, InputError, "at least 1"),
+        ({"temperature_k": 0.0}, InputError, "greater than 0"),
+        ({"timestep_ps": float("nan")}, InputError, "greater than 0"),
     ):
         with pytest.raises(error, match=said):
             RolloutConfig(time_ps=1.0, **wrong)  # type: ignore[arg-type]

@@ -112,7 +112,7 @@ def test_files_of_other_programs_roll_without_naming_weights(
     result = run("rollout", str(path), "--time", "3.2ns", "--save-every", "100ps", "-o", str(out))
     assert result.exit_code == 0, result.stderr
     said = " ".join((result.stdout + result.stderr).split())
-    assert "peptides" in said and "without having seen it" in said
+    assert "peptides" in said and "not in their training set" in said
     with open_trajectory(out) as reader:
         assert reader.scene is not None and reader.n_frames == 32
         phi = torsion(reader.read().astype(np.float64), backbone_torsions(reader.scene)["phi"])

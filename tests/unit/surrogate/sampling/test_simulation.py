@@ -195,6 +195,8 @@ def test_positions_can_be_set_and_other_molecules_are_refused(
     assert abs(float(simulation.positions_nm.mean(axis=0)[0]) - float(moved.mean(axis=0)[0])) < 0.1
     with pytest.raises(InputError, match="22 x 3"):
         simulation.context.setPositions(moved[:5])
+    with pytest.raises(OutOfDomainError, match="mirror image"):
+        simulation.context.setPositions(moved * [-1.0, 1.0, 1.0])
     mirrored = alanine_dipeptide.with_positions(alanine_dipeptide.positions_nm * [-1.0, 1.0, 1.0])
     with pytest.raises(OutOfDomainError, match="mirror image"):
         Simulation(mirrored, small_weights)

@@ -94,3 +94,11 @@ def test_a_single_path_is_one_candidate_and_no_other_file_is_read(
 def test_a_scene_may_be_a_path(here: Path, alanine_dipeptide: Scene) -> None:
     (here / "mine.pdb").write_text(pdb_text(alanine_dipeptide))
     assert sm.plan(here / "mine.pdb", platform="Reference")["force_field"] == "ff14SB"
+
+
+def test_what_is_no_scene_or_trajectory_is_refused_in_a_line(here: Path) -> None:
+    for call in (lambda: sm.plan(None), lambda: sm.reference(object(), "a.h5", time_ps=1.0)):
+        with pytest.raises(InputError, match="a scene is a file, a name"):
+            call()
+    with pytest.raises(InputError, match="a trajectory is a file, a folder"):
+        sm.compare(object(), object())

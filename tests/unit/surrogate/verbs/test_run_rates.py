@@ -85,8 +85,8 @@ def refuses(error: Exception) -> Callable[..., Any]:
 @pytest.mark.parametrize(
     ("error", "said"),
     [
-        (SimdUnavailableError(f"{NO_COMPILER}; take another platform."), NO_COMPILER),
-        (SimdUnavailableError("platform simd knows no CMAPTorsionForce; take another platform."), "CMAPTorsionForce"),
+        (SimdUnavailableError(f"{NO_COMPILER}; use another platform."), NO_COMPILER),
+        (SimdUnavailableError("platform simd does not support CMAP; use another platform."), "CMAP"),
         (SimulationError("a copy of the molecule blew up"), "blew up"),
     ],
 )

@@ -180,10 +180,12 @@ def test_the_table_links_each_report_and_takes_names_as_text(tmp_path: Path) -> 
     line = {
         "name": "<b>", "scene": "smiles:C", "failed": "", "way": "md", "wall_s": 61.0, "rolled_ps": 1500.0,
         "held_out_ps": 1234.0, "equivalent_time": "at least 1 ns", "speed_up": None, "verdict": "Close.",
+        "notes": ["stereocentre C2: <S>"],
     }  # fmt: skip
     write_results(tmp_path, [line, {"name": "x", "scene": "smiles:X", "failed": "no & such"}])
     page = (tmp_path / "index.html").read_text("utf-8")
     assert 'href="%3Cb%3E/report.html">&lt;b&gt;' in page and "1.2 ns" in page and "no &amp; such" in page
+    assert "Close.; stereocentre C2: &lt;S&gt;" in page
     assert json.loads((tmp_path / "results.json").read_text())[0] == line
 
 

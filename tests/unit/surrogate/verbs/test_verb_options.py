@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -86,6 +87,15 @@ def test_a_flag_left_out_is_the_keyword_left_out(monkeypatch: pytest.MonkeyPatch
         assert seen[name] == given, name
         assert stated[name].kind is inspect.Parameter.KEYWORD_ONLY
     assert not any(p.kind is inspect.Parameter.VAR_KEYWORD for p in stated.values())
+
+
+def test_a_run_warns_as_its_plan_does(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    natural = {"hydrogen_mass_da": None, "timestep_ps": "4fs"}
+    (warning,) = surrogate.plan("ACE-ALA-NME", **natural)["warnings"]
+    what = warning.partition(";")[0]  # advice names options as Python or the command line do
+    surrogate.reference("ACE-ALA-NME", tmp_path / "a.h5", time_ps="1ps", equilibrate_ps="0.1ps", **natural)
+    assert what == "4 fs is too long for hydrogens of natural mass"
+    assert capsys.readouterr().err.count(f"warning: {what}") == 1
 
 
 def test_a_keyword_that_is_none_is_refused_before_anything_else() -> None:

@@ -143,7 +143,7 @@ def test_a_phosphoserine_without_hydrogens_is_charged_and_covered(tmp_path: Path
     path.write_text("\n".join([*lines, "END", ""]))
     prepared = prepare(str(path))
     assert int(prepared.formal_charges.sum()) == -2
-    assert any("component dictionary" in line and "SEP" in line for line in prepared.provenance["repairs"])
+    assert any("Component Dictionary" in line and "SEP" in line for line in prepared.provenance["repairs"])
     assert resolve(prepared, ForceFieldSpec("auto", "auto")).force_field == "ff14SB"
 
 

@@ -1,6 +1,7 @@
 """Bonds whose vibration sets the longest time step."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -9,6 +10,7 @@ from md_reference.run.config import resolve_settings
 from surrogate.models.architecture import shipped_weights
 from surrogate.models.weights import load_weights
 from surrogate.sampling.domain import in_step
+from surrogate.sampling.runner import RolloutConfig, rollout
 from systems.chemistry.graph import has_stiff_bond
 from systems.errors import InputError
 from systems.library.named_scenes import prepare
@@ -59,16 +61,21 @@ def test_quantum_md_of_a_stiff_bond_takes_half_the_step() -> None:
     assert resolve_settings(nitrile, QUANTUM)[0]["timestep_ps"] == 0.002
     assert resolve_settings(ketone, QUANTUM)[0]["timestep_ps"] == 0.004
     with pytest.raises(
-        InputError, match=r"4 fs is too long for so stiff a bond \(.*\); use `timestep_ps='2fs'` or less"
+        InputError, match=r"4 fs is too long for a bond this stiff \(.*\); use `timestep_ps='2fs'` or less"
     ):
         resolve_settings(nitrile, QUANTUM | {"timestep_ps": 0.004})
     assert resolve_settings(nitrile, QUANTUM | {"hydrogen_mass_da": None})[0]["timestep_ps"] == 0.0005
 
 
-def test_a_potential_takes_the_step_of_the_molecule() -> None:
+def test_a_potential_takes_the_step_of_the_molecule(tmp_path: Path) -> None:
     weights = load_weights(shipped_weights()["paracetamol-gfn2-xtb"])
     shorter = in_step(weights, prepare("smiles:CC#N"))
     assert shorter.model.config.timestep_ps == shorter.domain.conditions["timestep_ps"] == 0.002
     assert in_step(weights, prepare("smiles:CC(C)=O")) is weights
     peptides = load_weights(shipped_weights()["peptides"])
     assert in_step(peptides, prepare("smiles:CC#N")) is peptides
+    asked = RolloutConfig(time_ps=1.0, timestep_ps=0.004)
+    with pytest.raises(
+        InputError, match=r"4 fs is too long for a bond this stiff \(.*\); use `timestep_ps='2fs'` or less"
+    ):
+        rollout(prepare("smiles:CC#N"), weights, [tmp_path / "a.h5"], asked)

@@ -103,9 +103,16 @@ def test_a_conect_record_of_one_alternate_holds_for_the_other(tmp_path: Path) ->
     conect = "CONECT   10   20\n"
     scene, notes = _prepared(tmp_path / "x.pdb", lines, conect)
     assert scene.formula == "C2H6" and len(scene.bonds) == 7
-    assert "(A200:B, A201:B), one label for what is bonded" in notes and "not made" not in notes
-    with pytest.raises(PreparationError, match="fit no valence"):  # without the record there is no bond
+    assert "(A200:B, A201:B), one label for what is bonded" in notes and "not used" not in notes
+    with pytest.raises(PreparationError, match="no valid Lewis structure"):  # without the record there is no bond
         _prepared(tmp_path / "y.pdb", lines)
+
+
+def test_a_blank_beside_a_label_is_another_alternate(tmp_path: Path, disulfide: list[str]) -> None:
+    lines = [ln for line in disulfide for ln in (_split(line, (0.3, 0.7), 0.3, " B") if "SG" in line else [line])]
+    scene, notes = _prepared(tmp_path / "x.pdb", lines)
+    assert "(A2:B, B2:B), one label for what is bonded, 2 atoms left out" in notes
+    assert scene.elements.count("S") == 2
 
 
 def test_a_peptide_bond_joins_alternates_of_one_label(tmp_path: Path) -> None:
@@ -126,13 +133,13 @@ def test_a_peptide_bond_joins_alternates_of_one_label(tmp_path: Path) -> None:
 
 def test_records_of_bonds_that_are_not_made_are_said(tmp_path: Path, disulfide: list[str]) -> None:
     _, notes = _prepared(tmp_path / "a.pdb", SSBOND, disulfide)
-    assert "not made" not in notes and "not used" not in notes
+    assert "not used" not in notes
     far = [
         line if line[21] == "A" else _at(line, [float(line[k : k + 8]) + 20 for k in (30, 38, 46)])
         for line in disulfide
     ]
     _, notes = _prepared(tmp_path / "b.pdb", SSBOND, far)
-    assert "stated bonds that are not made: CYS A2 SG - CYS B2 SG (3" in notes
+    assert "bonds stated in the file but not used: CYS A2 SG - CYS B2 SG (3" in notes
     _, notes = _prepared(tmp_path / "c.pdb", SSBOND.replace("B    2", "B    9"), far)
     assert "no such two atoms together: CYS A2 SG - CYS B9 SG" in notes
     _, notes = _prepared(tmp_path / "d.pdb", SSBOND.replace("1555   1555", "1555   2655"), far)

@@ -21,7 +21,7 @@ PEPTIDE = "".join(f"{line}\n" for line in pdb_text(ALA2).splitlines() if line.st
 
 
 def _atom(name: str, residue: str, number: int, at: tuple[float, float, float], element: str) -> AtomRecord:
-    return AtomRecord(name, element, residue, "W", str(number), at, hetero=True)
+    return AtomRecord(name, element, residue, "W", str(number), at)
 
 
 def _line(serial: int, name: str, residue: str, number: int, at: tuple[float, float, float], element: str = "") -> str:

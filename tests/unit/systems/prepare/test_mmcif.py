@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from systems.chemistry.graph import molecule_key
@@ -86,9 +87,22 @@ def test_waters_ligands_and_alternates_as_in_pdb_files(tmp_path: Path) -> None:
         prepare(bound)
     scene = prepare(path, keep_ligand=True)
     assert scene.provenance["repairs"][:1] == [
-        "alternate locations in 1 residues: the most occupied kept (X100:B), 1 atoms left out"
+        "alternate locations in 1 residue: the most occupied kept (X100:B), 1 atom left out"
     ]
     assert (scene.n_atoms, scene.elements[-1], int(scene.formal_charges[-1])) == (23, "Zn", 2)
+
+
+def test_coordinates_beyond_the_columns_of_a_pdb_file(tmp_path: Path) -> None:
+    rows = [row for row in _peptide(shift=-2000.0) if row.split()[2] != "H"]
+    scene = prepare(_write(tmp_path / "x.cif", rows))
+    heavy = [i for i, e in enumerate(scene.elements) if e != "H"]
+    expected = [p for p, e in zip(ALA2.positions_nm, ALA2.elements, strict=True) if e != "H"]
+    assert scene.n_atoms == 22 and scene.positions_nm[heavy] + 200.0 == pytest.approx(np.array(expected), abs=1e-3)
+
+
+def test_the_formal_charge_of_an_ion_is_read(tmp_path: Path) -> None:
+    ion = _row(99, "CU", "CU", "9", (30.0, 30.0, 30.0), "CU", group="HETATM").replace("20.0 ? 9", "20.0 1 9")
+    assert prepare(_write(tmp_path / "x.cif", [*_peptide(), ion]), keep_ligand=True).formal_charges[-1] == 1
 
 
 def test_a_cut_file_is_refused(tmp_path: Path) -> None:
@@ -134,6 +148,9 @@ def test_a_component_of_the_dictionary_is_a_molecule(tmp_path: Path) -> None:
     assert (scene.name, scene.atom_names, scene.residue_names) == ("TFA", ("C1'", "O1", "O2", "H1"), ("TFA",))
     assert scene.formal_charges.tolist() == [0, 0, -1, 0] and scene.bond_orders.tolist() == [2.0, 1.0, 1.0]
     assert scene.positions_nm[3].tolist() == pytest.approx([-0.06, -0.092, 0.0])
+    path.write_text(COMPONENT.replace("DOUB", "deloc"))
+    with pytest.raises(InputError, match="bonds of type 'deloc', which do not fix a Lewis structure"):
+        prepare(str(path))
     for wrong, match in (("DOUB", "QUUX"), ("H1    H ", "H1    Qq"), (" 0.00 0.00 0.00", " 0.00 0.00")):
         path.write_text(COMPONENT.replace(wrong, match))
         with pytest.raises(InputError, match=r"TFA.cif"):

@@ -105,7 +105,7 @@ def test_a_carbocation_is_taken_on_the_word_of_its_charges_alone(tmp_path: Path)
     trityl = scene_from_smiles("[C+](c1ccccc1)(c1ccccc1)c1ccccc1")
     text = _mol2(trityl, GAFF, charges=[1.0 / trityl.n_atoms] * trityl.n_atoms)
     assert int(_read(tmp_path, text).formal_charges.sum()) == 1
-    with pytest.raises(PreparationError, match="fit no valence"):
+    with pytest.raises(PreparationError, match="no valid Lewis structure"):
         _read(tmp_path, _mol2(trityl, GAFF))
 
 
@@ -130,7 +130,7 @@ def test_molecules_without_hydrogens_are_whole(tmp_path: Path, smiles: str) -> N
 def test_a_drawing_is_embedded(tmp_path: Path) -> None:
     scene = _read(tmp_path, _mol2(scene_from_smiles("CCO"), SYBYL, flat=True))
     assert np.abs(scene.positions_nm[:, 2]).max() > 0.01
-    assert "a flat drawing" in scene.provenance["repairs"][0]
+    assert "2-D structure" in scene.provenance["repairs"][0]
 
 
 def test_broken_records_are_named(tmp_path: Path) -> None:

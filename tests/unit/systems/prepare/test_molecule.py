@@ -58,7 +58,7 @@ def test_each_is_prepared_as_it_is_known(case: Case) -> None:
     asked, drawn = stereo_labels(given), stereo_labels(to_rdkit(scene))
     assert "".join(sorted(asked.values())) == case.stereo
     assert {k: drawn.get(k) for k in asked} == asked
-    said = [line for line in scene.provenance["repairs"] if "not specified: drawn as" in line]
+    said = [line for line in scene.provenance["repairs"] if "not specified in the input" in line]
     assert len(said) == len(set(drawn) - set(asked))
     assert [a.GetFormalCharge() for a in given.GetAtoms()] == scene.formal_charges.tolist()
     assert len(set(scene.atom_names)) == scene.n_atoms and max(map(len, scene.atom_names)) <= 4
@@ -118,6 +118,7 @@ def test_what_is_left_out_is_said() -> None:
         ("C(C)(C)(C)(C)C", "valence"),
         ("CC>>CO", "cannot be read"),
         ("*CC", "wildcard"),
+        ("C~C", "the bond C1 - C2 has no order"),
         ("[Na+]", "metals"),
         ("[Ar]", "it holds Ar"),
         ("C" * 1200, "embedded up to 999"),
@@ -184,7 +185,11 @@ def _flat(whole: Any) -> str:
         ("sdf", lambda m: Chem.MolToV3KMolBlock(m) + "$$$$\n", []),
         ("sdf", lambda m: (Chem.MolToMolBlock(m) + "$$$$\n") * 2, ["2 molecules in the file: the first is taken"]),
         ("mol", lambda m: Chem.MolToMolBlock(Chem.RemoveHs(m)), ["hydrogens added: 15"]),
-        ("mol", _flat, ["hydrogens added: 15", "a flat drawing: 3-D coordinates embedded, stereo from its wedges"]),
+        (
+            "mol",
+            _flat,
+            ["hydrogens added: 15", "2-D structure: 3-D coordinates generated, stereochemistry from the wedge bonds"],
+        ),
     ],
     ids=["mol", "v3000", "two", "no-hydrogens", "flat"],
 )
@@ -243,21 +248,27 @@ def test_mol2_charges_are_checked(tmp_path: Path) -> None:
 def test_broken_mol_files_are_refused_in_one_line(tmp_path: Path, molecule: Any) -> None:
     block = Chem.MolToMolBlock(molecule)
     lines = block.splitlines()
+    at = 4 + molecule.GetNumAtoms()
+    untyped = {
+        k: "\n".join([*lines[:at], f"{lines[at][:6]}{k:3d}{lines[at][9:]}", *lines[at + 1 :]]) for k in (0, 5, 8)
+    }
     twice = [*lines[:5], lines[4][:30] + lines[5][30:], *lines[6:]]
     for name, text, expected in (
         ("empty.sdf", "", "is empty"),
         ("prose.mol", "This is not\na molecule.\n", "no molecule that can be read"),
         ("cut.mol", block[: len(block) // 2], "no molecule that can be read"),
         ("x.mol2", block, "no @<TRIPOS>MOLECULE"),
-        ("twice.mol", "\n".join(twice), "stand on one point"),
+        ("twice.mol", "\n".join(twice), "have the same coordinates"),
+        *((f"type{k}.mol", text, "the bond C1 - .* has no order") for k, text in untyped.items()),
         ("mixture.mol", Chem.MolToMolBlock(Chem.MolFromSmiles("CCO.c1ccccc1")), "2 fragments"),
     ):
         (tmp_path / name).write_text(text)
         with pytest.raises(InputError, match=expected) as caught:
             prepare(str(tmp_path / name))
         assert name in str(caught.value) and "\n" not in str(caught.value)
-    with pytest.raises(InputError, match="does not exist"):
-        prepare(str(tmp_path / "missing.sdf"))
+    for missing in (str(tmp_path / "missing.sdf"), "F/C=C/F", "CCO.CCN"):
+        with pytest.raises(InputError, match=r"does not exist; .* a molecule is given as smiles:\.\.\., a peptide"):
+            prepare(missing)
 
 
 # ---- the comparison of the benchmark ---------------------------------------------------------------------------------
@@ -323,7 +334,7 @@ def test_charges_that_a_file_leaves_out_are_asked_for(tmp_path: Path) -> None:
     (tmp_path / "x.sdf").write_text("\n".join(lines))
     assert int(prepare(str(tmp_path / "x.sdf")).formal_charges.sum()) == 1
     (tmp_path / "x.sdf").write_text("\n".join(line for line in lines if not line.startswith("M  CHG")))
-    with pytest.raises(PreparationError, match=r"no possible molecule: .* valence .* .a charge left out"):
+    with pytest.raises(PreparationError, match=r"RDKit rejects it: .* valence .* .is a formal charge missing"):
         prepare(str(tmp_path / "x.sdf"))
 
 

@@ -58,7 +58,7 @@ def test_matrices_of_the_header_are_no_atoms(tmp_path: Path) -> None:
 
 def test_end_ends_a_structure(tmp_path: Path) -> None:
     scene = read(tmp_path, [*ROWS, "END", *shifted(ROWS, 0.2), "END"])
-    assert said(scene) == "22 atoms after END left out: they are another structure"
+    assert said(scene) == "22 atoms after END left out, of another structure"
     assert scene.positions_nm == pytest.approx(ALA2.positions_nm, abs=1e-4)
     conect = [f"CONECT{i + 1:5d}{j + 1:5d}" for i, j in ALA2.bonds.tolist()]
     ligand = [line.replace(line[17:20], "LIG").replace("A   " + line[25], "A   1") for line in ROWS]
@@ -66,11 +66,24 @@ def test_end_ends_a_structure(tmp_path: Path) -> None:
     assert said(scene) == "LIG A1: bonds from CONECT records"
 
 
+def test_models_without_their_first_line_are_said(tmp_path: Path) -> None:
+    scene = read(tmp_path, [*ROWS, "ENDMDL", *shifted(ROWS, 0.2), "ENDMDL", "END"])
+    assert said(scene) == "22 atoms after ENDMDL left out, of another model"
+    numbered = ["MODEL        1", *ROWS, "ENDMDL", "MODEL        2", *shifted(ROWS, 0.2), "ENDMDL", "END"]
+    assert said(read(tmp_path, numbered)) == "2 models in the file: the first is taken"
+
+
+def test_chains_of_two_letters_are_read(tmp_path: Path) -> None:
+    water = WATER[0].replace("SOL  ", "HOHAB")
+    scene = read(tmp_path, [*(f"{line[:20]}AB{line[22:]}" for line in ROWS), water])
+    assert set(scene.chain_of_residue) == {"AB"} and said(scene) == "1 water molecule left out"
+
+
 def test_an_atom_written_twice_is_one(tmp_path: Path) -> None:
     scene = read(tmp_path, [*ROWS[:9], ROWS[8][:60], *ROWS[9:]])
-    assert (scene.n_atoms, said(scene)) == (22, "1 atom written twice on one point: one of each left out")
+    assert (scene.n_atoms, said(scene)) == (22, "1 atom written twice at the same coordinates: one of each left out")
     other = ROWS[8][:12] + " CB " + ROWS[8][16:]
-    with pytest.raises(PreparationError, match="stand on one point"):
+    with pytest.raises(PreparationError, match="have the same coordinates"):
         read(tmp_path, [*ROWS[:9], other, *ROWS[9:]])
 
 
@@ -80,17 +93,19 @@ def test_molecules_numbered_alike_are_chains_of_their_own(tmp_path: Path) -> Non
         scene = read(tmp_path, [*plain, *between, *shifted(plain, 20.0)])
         assert scene.residue_names == ("ACE", "ALA", "NME") * 2
         assert scene.chain_of_residue == ("", "", "", ":2", ":2", ":2")
-        assert said(scene) == "residue numbers come again: :2 are chains of their own"
+        assert said(scene) == "residue numbers repeat: treated as separate chains :2"
         assert len(scene.bonds) == 2 * len(ALA2.bonds)
 
 
 def test_virtual_sites_and_drude_particles_are_left_out(tmp_path: Path) -> None:
     scene = read(tmp_path, [*ROWS, *WATER], drop_water=True)
-    assert said(scene) == "1 virtual sites and Drude particles left out: MW | 1 water molecule left out"
+    assert said(scene) == "virtual sites and Drude particles left out (1): MW | 1 water molecule left out"
     drude = [f"{line[:12]} D{line[13:15].strip():<2s}{line[16:66]}" for line in ROWS if line[12:15] in (" N ", " CA")]
     lone = f"{ROWS[4][:12]} LPA{ROWS[4][16:30]}{float(ROWS[4][30:38]) + 0.3:8.3f}{ROWS[4][38:66]}"
     scene = read(tmp_path, [*ROWS, *drude, lone])
-    assert scene.n_atoms == 22 and said(scene).startswith(f"{len(drude) + 1} virtual sites and Drude particles left")
+    assert scene.n_atoms == 22 and said(scene).startswith(
+        f"virtual sites and Drude particles left out ({len(drude) + 1})"
+    )
     far = drude[0][:30] + "  50.000" + drude[0][38:]
     with pytest.raises(InputError, match="no recognisable element"):
         read(tmp_path, [*ROWS, far])
@@ -126,8 +141,8 @@ def test_an_element_column_that_repeats_the_name_is_no_metal(tmp_path: Path) -> 
 
 
 @pytest.mark.parametrize(("gap", "elements", "expected"), [
-    (1.6, "CO", ""), (1.4, "CO", "minimising"), (0.85, "CO", "minimising"), (1.0, "CH", "minimising"),
-    (0.2, "CO", "minimising"), (0.8, "HH", "minimising"), (0.05, "CO", "refused"), (0.0, "HH", "refused"),
+    (1.6, "CO", ""), (1.4, "CO", "minimisation"), (0.85, "CO", "minimisation"), (1.0, "CH", "minimisation"),
+    (0.2, "CO", "minimisation"), (0.8, "HH", "minimisation"), (0.05, "CO", "refused"), (0.0, "HH", "refused"),
 ])  # fmt: skip
 def test_atoms_in_one_place_are_refused_and_close_ones_said(gap: float, elements: str, expected: str) -> None:
     atoms = [AtomRecord(e, e, "LIG", "A", str(k), (k * gap, 0.0, 0.0)) for k, e in enumerate(elements)]
@@ -165,6 +180,7 @@ def test_a_lactam_keeps_what_it_lost(shared_data: Path, tmp_path: Path, left_out
 @pytest.mark.parametrize(("name", "residue", "hetero", "symbol"), [
     ("CL1 ", "00T", False, "Cl"), (" CL ", "LIG", True, "Cl"), ("BR  ", "ABC", False, "Br"), (" CL ", "ALA", True, "C"),
     (" CLP", "ABC", False, "C"), (" CA ", "ALA", True, "C"), ("SE  ", "MSE", True, "Se"), (" NA ", "HEM", True, "N"),
+    ("NAAB", "LIG", True, "N"), ("NA  ", "LIG", True, "Na"), ("NA1 ", "DRG", False, "Na"), ("CLAA", "LIG", True, "Cl"),
 ])  # fmt: skip
 def test_elements_by_names_where_the_column_is_empty(name: str, residue: str, hetero: bool, symbol: str) -> None:
     assert element_symbol(name, residue, "", hetero=hetero) == symbol

@@ -276,7 +276,7 @@ def test_impossible_coordinates_are_refused(tmp_path: Path) -> None:
     assert "three coordinates" in _refusal(tmp_path / "star.pdb")
     same = ALA2.positions_nm.copy()
     same[10] = same[8]
-    assert "one point" in _refusal(_pdb(tmp_path / "same.pdb", same))
+    assert "have the same coordinates" in _refusal(_pdb(tmp_path / "same.pdb", same))
     far = ALA2.positions_nm.copy()
     far[0] += 2.0
     assert "nearest heavy atom" in _refusal(_pdb(tmp_path / "far.pdb", far))
@@ -288,7 +288,7 @@ def test_structures_beyond_repair_are_refused(tmp_path: Path) -> None:
     ligand = _pdb(tmp_path / "lig.pdb", residues=["LIG"] * 22, numbers=[1] * 22, order=ALA2.heavy_idx.tolist())
     assert "no hydrogens" in _refusal(ligand)
     lost = _pdb(tmp_path / "lost.pdb", residues=["LIG"] * 22, numbers=[1] * 22, order=_subset(lambda i: i != 13))
-    assert "no valence" in _refusal(lost)
+    assert "no valid Lewis structure" in _refusal(lost)
     broken = ALA2.positions_nm.copy()
     broken[16:] += 0.5
     assert "OXT" in str(prepare(str(_pdb(tmp_path / "cap.pdb", broken[:16], order=range(16)))).provenance["repairs"])

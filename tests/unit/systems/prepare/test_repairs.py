@@ -96,11 +96,8 @@ def test_bonded_foreign_residues_are_no_ligands() -> None:
 def test_selenomethionine_becomes_methionine_and_is_said() -> None:
     atoms = [_record("SE", "MSE", "7", 0, 0, 0, "Se"), _record("CE", "MSE", "7", 1.9, 0, 0, "C")]
     notes: list[str] = []
-    out = standardise([replace(a, hetero=True) for a in atoms], notes)
-    assert [(a.name, a.element, a.residue_name, a.hetero) for a in out] == [
-        ("SD", "S", "MET", False),
-        ("CE", "C", "MET", False),
-    ]
+    out = standardise(atoms, notes)
+    assert [(a.name, a.element, a.residue_name) for a in out] == [("SD", "S", "MET"), ("CE", "C", "MET")]
     assert notes == ["selenomethionine made methionine (SE to SD): A7"]
 
 
@@ -242,8 +239,8 @@ def test_completion_never_turns_a_residue_over(monkeypatch: pytest.MonkeyPatch, 
     """Negative control of the check around `complete`: a repair that mirrors what it returns is refused."""
     import systems.prepare.repair
 
-    def mirrored(atoms, bonding, *, ph):
-        records, bonds, summary = complete(atoms, bonding, ph=ph)
+    def mirrored(atoms, bonding, **settings):
+        records, bonds, summary = complete(atoms, bonding, **settings)
         flip = [replace(a, position_angstrom=(*a.position_angstrom[:2], -a.position_angstrom[2])) for a in records]
         return flip, bonds, summary
 
@@ -342,11 +339,23 @@ def test_missing_atoms_are_added_although_their_hydrogens_are_there(tmp_path: Pa
     scene = prepare(_write(tmp_path / "x.pdb", *heavy))
     assert molecule_key(scene) == molecule_key(whole)
     notes = " | ".join(scene.provenance["repairs"])
-    assert "hydrogens left out whose atoms are missing: SER A2 H" in notes and f"added {' '.join(lost)}" in notes
+    assert (
+        "hydrogens removed because their heavy atoms are missing: SER A2 H" in notes
+        and f"added {' '.join(lost)}" in notes
+    )
     far = [line[:30] + f"{float(line[30:38]) + 5.0:8.3f}" + line[38:] if line[12:16].strip() == "HG" else line
            for line in lines]  # fmt: skip
     with pytest.raises(PreparationError, match="Hydrogen SER A2 HG is"):  # control: nothing is missing
         prepare(_write(tmp_path / "y.pdb", *far))
+
+
+def test_a_missing_carbonyl_oxygen_breaks_no_chain_and_other_names_are_said(tmp_path: Path) -> None:
+    whole = prepare("sequence:ACE-SER-NME")
+    lines = [ln for ln in pdb_text(whole).splitlines(keepends=True) if ln.startswith("ATOM") and ln[77] != "H"]
+    scene = prepare(_write(tmp_path / "x.pdb", *(ln for ln in lines if ln[12:20] != " O   SER")))
+    assert molecule_key(scene) == molecule_key(whole) and "SER A2: added O" in scene.provenance["repairs"]
+    with pytest.raises(PreparationError, match=r"SER A2 has atoms that no SER has \(OX9\); rename or delete them"):
+        prepare(_write(tmp_path / "y.pdb", *(ln.replace(" OG ", " OX9") for ln in lines)))
 
 
 def test_a_hydrogen_at_anothers_methyl_is_a_clash(tmp_path: Path) -> None:

@@ -57,8 +57,11 @@ def test_sequence_text_is_parsed_or_refused_in_one_line() -> None:
         ("", "write capitals"),
         ("ACE", "alone or inside"),
         ("A" * 500, "up to 200"),
+        ("A", r"a single amino acid; cap it \(ACE-ALA-NME\)"),
         ("ALA--ALA", "unknown residue ''"),
     ):
         with pytest.raises(PreparationError, match=expected) as caught:
             prepare(f"sequence:{text}")
         assert "\n" not in str(caught.value)
+    notes = [prepare(f"sequence:{text}").provenance["repairs"] for text in ("AG", "ag")]
+    assert [any("read as L-residues" in note for note in some) for some in notes] == [False, True]

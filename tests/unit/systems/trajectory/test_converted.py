@@ -94,6 +94,11 @@ def test_uneven_times_are_refused_where_they_would_be_lost(tmp_path: Path, alani
     with pytest.raises(InputError, match="unevenly spaced"):
         to_mdanalysis(path)
     assert to_mdanalysis(path, stop=2).trajectory.n_frames == 2
+    for step_ps, start_ps in ((0.1, 0.0), (2.0, 1e5), (0.7, 3e4)):  # as float32 has them, in other programs' files
+        other = tmp_path / f"{step_ps}.h5"
+        times = (start_ps + step_ps * np.arange(50)).astype(np.float32).astype(np.float64)
+        write(other, alanine_dipeptide, times)
+        assert to_mdanalysis(other).trajectory.dt == pytest.approx(step_ps, rel=1e-3)
     with pytest.raises(TrajectoryError):
         to_mdtraj(tmp_path / "none.h5")
 

@@ -16,6 +16,7 @@ from systems.chemistry.distance_bonds import bonds_by_distance
 from systems.chemistry.graph import molecule_key
 from systems.errors import InputError, TrajectoryError
 from systems.scene import Scene
+from systems.trajectory import foreign_readers
 from systems.trajectory.codec import open_trajectory
 from systems.trajectory.companion_writer import pdb_text
 from systems.trajectory.dcd_file import AKMA_PS, cells_of_blocks
@@ -164,7 +165,7 @@ def test_trr_frames_without_positions_are_left_out(tmp_path: Path, frames: np.nd
         assert reader.n_frames == has.sum() and reader.read() == pytest.approx(frames[has], abs=1e-6)
         assert reader.read(1, 4, 2) == pytest.approx(frames[has][1:4:2], abs=1e-6)
         assert np.array_equal(reader.time_ps, 2.0 * np.flatnonzero(has))
-        assert reader.notes == (f"{(~has).sum()} frames hold no positions and are left out.",)
+        assert reader.notes == (f"frames without positions, left out: {(~has).sum()}.",)
     with TRRFile(str(tmp_path / "whole.trr"), "w") as out:
         for k, x in enumerate(frames):
             out.write(x.copy(), x.copy(), None, box, k, 2.0 * k, 0.0, 22)
@@ -190,7 +191,7 @@ def test_netcdf_is_read_in_its_convention_alone(tmp_path: Path, frames: np.ndarr
     for length, time, scale in ((b"nanometer", b"picosecond", None), (b"angstrom", b"femtosecond", None),
                                 (b"angstrom", b"picosecond", 10.0)):  # fmt: skip
         write_netcdf(path, frames, TIMES, length, time, scale)
-        with pytest.raises(TrajectoryError, match=r"are scaled, or in"):
+        with pytest.raises(TrajectoryError, match=r"is scaled or in"):
             open_trajectory(path)
 
 
@@ -307,6 +308,30 @@ def test_cells_are_read(tmp_path: Path, alanine_dipeptide: Scene, frames: np.nda
         with open_trajectory(path) as reader:
             cells = reader.read_cells(2, 8, 3)
             assert cells is not None and cells == pytest.approx(np.repeat(box[None], 2, axis=0), abs=2e-4)
+
+
+def test_a_cell_of_zeros_is_none(tmp_path: Path, alanine_dipeptide: Scene) -> None:
+    zeros = "CRYST1    0.000    0.000    0.000  90.00  90.00  90.00 P 1           1\n"
+    (tmp_path / "a.pdb").write_text(zeros + pdb_text(alanine_dipeptide))
+    with open_trajectory(tmp_path / "a.pdb") as reader:
+        assert reader.read_cells() is None
+
+
+def test_cells_are_read_block_by_block(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    spans: list[int] = []
+    stored = foreign_readers.StreamReader._stored
+
+    def counting(self: foreign_readers.StreamReader, start: int, stop: int) -> list[object]:
+        spans.append(stop - start)
+        return stored(self, start, stop)
+
+    monkeypatch.setattr(foreign_readers, "_PASS_FRAMES", 2)
+    monkeypatch.setattr(foreign_readers.StreamReader, "_stored", counting)
+    for suffix in ("xtc", "trr", "nc"):
+        with open_trajectory(folder / f"mdtraj.{suffix}") as reader:
+            cells = reader.read_cells(1, N, 2)
+            assert cells is not None and cells == pytest.approx(np.repeat(BOX[None], N // 2, axis=0), abs=2e-4)
+    assert max(spans) <= 2 < N
 
 
 def test_a_psf_is_a_topology(shared_data: Path) -> None:

@@ -11,6 +11,7 @@ import pytest
 
 from surrogate.verbs.inputs import check_outputs
 from systems.errors import SimulationError, TrajectoryError
+from systems.library.named_scenes import prepare
 from systems.scene import Scene, reordered
 from systems.trajectory.checkpoint import locked_outputs
 from systems.trajectory.codec import WRITTEN, open_trajectory, open_writer
@@ -47,6 +48,21 @@ def test_the_pdb_beside_a_trajectory_has_its_order(tmp_path: Path, alanine_dipep
     for name in ("ref", "out"):
         assert longest_bond_angstrom(tmp_path / f"{name}{suffix}", tmp_path / f"{name}.pdb") < 1.6
     assert longest_bond_angstrom(tmp_path / f"ref{suffix}", tmp_path / "out.pdb") > 4.0
+
+
+def test_the_pdb_of_another_molecule_is_not_replaced(tmp_path: Path, alanine_dipeptide: Scene) -> None:
+    write(tmp_path / "a.h5", alanine_dipeptide)
+    before = (tmp_path / "a.pdb").read_bytes()
+    with pytest.raises(TrajectoryError, match=r"a\.pdb is the topology of a\.h5, of other atoms"):
+        write(tmp_path / "a.xtc", prepare("smiles:CCO"))
+    assert (tmp_path / "a.pdb").read_bytes() == before and sorted(p.name for p in tmp_path.iterdir()) == [
+        "a.h5",
+        "a.pdb",
+    ]
+    moved = alanine_dipeptide.with_positions(alanine_dipeptide.positions_nm + 0.1)
+    write(tmp_path / "a.xtc", moved)
+    write(tmp_path / "b.h5", prepare("smiles:CCO"))
+    write(tmp_path / "b.h5", alanine_dipeptide, overwrite=True)
 
 
 @pytest.mark.parametrize("suffix", SUFFIXES)

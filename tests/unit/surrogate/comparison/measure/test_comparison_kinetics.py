@@ -243,16 +243,18 @@ def phi_of(ensemble: Ensemble) -> np.ndarray:
     return torsion(ensemble.segments[0][:], backbone_torsions(ensemble.scene)["phi"])[:, 0]
 
 
-def test_a_process_into_a_state_that_is_never_held_is_not_timed(inputs: tuple[Ensemble, Ensemble, Ensemble]) -> None:
+def test_a_process_into_a_state_that_is_never_held_is_not_timed(
+    inputs: tuple[Ensemble, Ensemble, Ensemble], monkeypatch: pytest.MonkeyPatch
+) -> None:
     """The toy's left-handed state (phi > 0) is cut out of the candidate, or of the replicate."""
     from dataclasses import replace
 
     reference, candidate, replicate = inputs
-    options = replace(QUICK, tica_lag_ps=2.0)
+    monkeypatch.setattr(kinetics, "TICA_LAG_PS", 2.0)
     keep = phi_of(candidate) < 0
     keep[[np.argmin(keep), len(keep) - 1 - np.argmin(keep[::-1])]] = True  # two frames that stray are no visit
     blind = replace(candidate, segments=[candidate.segments[0][:][keep]])
-    fair, wrong = compare(reference, [candidate, blind], replicate, options=options).evaluations
+    fair, wrong = compare(reference, [candidate, blind], replicate, options=QUICK).evaluations
     timed = {row.key for row in fair.rows if row.key.startswith("msm_timescale")}
     assert len(timed) >= 2
     assert not any(what.startswith("Implied timescale") for what, _ in fair.skipped)
@@ -273,7 +275,7 @@ def test_a_process_into_a_state_that_is_never_held_is_not_timed(inputs: tuple[En
     assert drawn(wrong, "candidate") == len(timed) - 1 == drawn(fair, "candidate") - 1
 
     lame = replace(replicate, segments=[replicate.segments[0][:][phi_of(replicate) < 0]])
-    (other,) = compare(reference, [candidate], lame, options=options).evaluations
+    (other,) = compare(reference, [candidate], lame, options=QUICK).evaluations
     gone = [row for row in other.rows if row.key.startswith("msm_timescale") and not np.isfinite(row.replicate.value)]
     assert len(gone) == len(left_out) and all(np.isfinite(row.candidate.value) for row in gone)
     assert all(row.verdict in ("agrees", "undecided") for row in gone)

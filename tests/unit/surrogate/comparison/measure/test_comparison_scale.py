@@ -24,6 +24,7 @@ def test_more_torsions_than_frames_have_no_slowest_combination() -> None:
     assert kinetics.fit_projection([few], 1) is None
     assert kinetics.fit_projection([many], 1) is not None, "negative control"
     assert kinetics.fit_projection([np.empty((90, 0))], 1) is None
+    assert kinetics.fit_projection([1e-5 * many], 1) is None, "varies by no more than rounding"
 
 
 def test_states_that_cannot_be_lumped_give_no_model(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -83,6 +84,7 @@ def test_words_for_a_deviation() -> None:
     assert time.deviation(3.0, 3.001) == "relaxation time of x: 3 ps instead of 3.001 ps", "as many digits as it takes"
     assert time.deviation(math.nan, 3.0) == "relaxation time of x: it does not move"
     shift = Quantity("x", "structure", "Largest shift", "°", 1.0, hint="; a hint")
+    assert shift.deviation(math.nan, 2.0) == "largest shift: not defined"
     assert shift.deviation(1.0, 2.0, "N-CA-C") == "largest shift, N-CA-C: 1° instead of 2°; a hint"
 
 
@@ -101,7 +103,7 @@ def test_adenylate_kinase_is_evaluated(shared_data: Path) -> None:
     base = np.array(whole.segments[0])
     paths = [replace(whole, segments=[noisy_path(base, seed)], label=f"path {seed}") for seed in range(3)]
     found = compare(paths[0], [paths[1]], paths[2]).evaluations[0]
-    assert found.status == "undecided" and "too few to compare with" in found.verdict
+    assert found.status == "undecided" and "(20 are needed)" in found.verdict
     assert len(found.rows) < 120 and found.row("joint_jsd").metric.endswith("mean of 16 residues")
     skipped = dict(found.skipped)
     assert skipped["TICA at a lag of 10 ps"] == kinetics.WITHOUT_TICA

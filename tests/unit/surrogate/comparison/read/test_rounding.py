@@ -39,6 +39,19 @@ def runs(simulate: Callable[..., Ensemble]) -> Runs:
     return made[0], made[1], made[2]
 
 
+def test_a_bond_that_breaks_and_a_frame_that_is_not_finite_leave_the_temperature(
+    simulate: Callable[..., Ensemble],
+) -> None:
+    three = [simulate(k, 400) for k in (1, 2, 3)]
+    for run in three:
+        run.segments[0][::50, 0] += 0.1  # a hydrogen that hops, in 2 % of frames
+    three[0].segments[0][7] = np.nan
+    found = compare(*([replace(e, grids_nm=(1e-3,))] if e is three[1] else replace(e, grids_nm=(1e-3,))
+                      for e in three), options=OPTIONS)  # fmt: skip
+    assert any("bond H1-CH3" in n for n in found.notes)
+    assert found.evaluations[0].row("temperature").candidate.value == pytest.approx(300.0, abs=60.0)
+
+
 def as_xtc(run: Ensemble, folder: Path, decimals: int, frames: np.ndarray | None = None) -> Ensemble:
     """The run as MDAnalysis writes it: `decimals` of a nanometre."""
     mda = pytest.importorskip("MDAnalysis")

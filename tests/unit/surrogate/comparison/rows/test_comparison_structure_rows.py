@@ -49,9 +49,7 @@ def evaluated(ensembles: tuple[Ensemble, Ensemble, Ensemble]) -> Comparison:
         three = fixed[0], measured(ensembles[1], frames), fixed[1]
         samples = [make_sample(f, make_blocks(f.segment_lengths, 200), OPTIONS, k) for k, f in enumerate(three)]
         inputs = ComparisonInput(reference.scene, baseline.torsions, baseline.geometry, *samples, OPTIONS)
-        return {
-            row.key: row for row in evaluated_rows([r for measure in METRICS for r in measure(inputs).rows], OPTIONS)
-        }
+        return {row.key: row for row in evaluated_rows([r for measure in METRICS for r in measure(inputs).rows])}
 
     return compare
 
@@ -187,7 +185,7 @@ def test_hydrogen_bonds_that_are_never_formed_are_missed(ensembles: tuple[Ensemb
             ComparisonInput(reference.scene, baseline.torsions, baseline.geometry, *samples, OPTIONS)
         )
         assert len(charts) == 1
-        return {row.key: row for row in evaluated_rows(found, OPTIONS)}
+        return {row.key: row for row in evaluated_rows(found)}
 
     key = "hydrogen_bond_shift"
     assert set(rows(0.3)) == {"hydrogen_bonds", key}
@@ -195,6 +193,28 @@ def test_hydrogen_bonds_that_are_never_formed_are_missed(ensembles: tuple[Ensemb
     wrong = rows(0.0)
     assert {r.verdict for r in wrong.values()} == {"differs"}
     assert "N-H (NME 3) ... O (ACE 1): 0 % instead of" in wrong[key].statement
+
+
+def test_a_ring_puckers_as_often_as_in_the_reference() -> None:
+    """Tetrahydropyran's two chairs: half of the time each, or one of them rarely."""
+    from systems.library.named_scenes import prepare
+    from systems.prepare.ring_conformers import ring_conformers
+
+    scene = prepare("smiles:C1CCOCC1")
+    forms = np.stack(ring_conformers(scene)[:2])
+
+    def run(seed: int, share: float) -> Ensemble:
+        rng = np.random.default_rng(seed)
+        x = forms[(rng.random(1000) < share).astype(int)]
+        return Ensemble("x", [(x + rng.normal(0, 0.003, x.shape)).astype(np.float32)], 1.0, scene)
+
+    baseline = Baseline.of(run(1, 0.5))
+    for share, words in ((0.5, ("agrees",)), (0.04, BAD)):
+        three = [baseline.measure(run(k, s)) for k, s in ((1, 0.5), (2, share), (3, 0.5))]
+        samples = [make_sample(f, make_blocks(f.segment_lengths, 20), OPTIONS, k) for k, f in enumerate(three)]
+        inputs = ComparisonInput(scene, baseline.torsions, baseline.geometry, *samples, OPTIONS)
+        (row,) = (r for r in evaluated_rows(other_torsion_rows(inputs).rows) if r.key == "torsions_jsd:ring")
+        assert row.verdict in words and row.metric == "Ring puckers, distance"
 
 
 def test_ends_are_those_of_the_chain() -> None:

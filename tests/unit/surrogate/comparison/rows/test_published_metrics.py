@@ -92,6 +92,7 @@ def test_candidates_of_one_length_share_what_is_fitted_on_the_reference(
 
     def distances(evaluation: Evaluation) -> list[float]:
         (bars,) = (c for c in evaluation.charts if getattr(c, "title", "") == "By the peptide papers' recipe")
+        assert "a Markov state model of 12 clusters and 3 metastable states" in bars.caption
         return list(bars.to_dict()["lines"][1]["y"])
 
     monkeypatch.setattr(published_metrics, "fit_recipe", counted)

@@ -11,9 +11,12 @@ import pytest
 
 from surrogate.comparison import comparison
 from surrogate.comparison.measure.distributions import RAMACHANDRAN_BINS, TORSION_BINS
+from surrogate.comparison.measure.statistics import make_blocks
+from surrogate.comparison.measure.structure import Features, backbone
 from surrogate.comparison.read.ensemble import Ensemble
-from surrogate.comparison.rows.rows import Options
-from surrogate.comparison.rows.torsion_rows import Visits, visits_of, visits_p, without_positive_phi
+from surrogate.comparison.rows.rows import ComparisonInput, Options, make_sample
+from surrogate.comparison.rows.torsion_rows import Visits, free_energy_row, visits_of, visits_p, without_positive_phi
+from systems.scene import Scene
 
 Simulate = Callable[..., Ensemble]
 # The published recipe takes half of the time here, and no verdict rests on it.
@@ -64,7 +67,8 @@ def test_runs_of_one_simulation_agree_however_often_they_met_a_rare_state(simula
         assert row.verdict in ("agrees", "undecided"), row.statement
         assert row.candidate.low < math.log(49) < row.candidate.high, "4e-4 * 50 of the time"
         assert not [r.key for r in found.rows if r.verdict == "differs"], found.findings
-        assert "at φ < 0" in found.row("joint_jsd").metric and "at φ < 0" in found.row("phi_jsd").metric
+        assert found.row("joint_jsd").metric == "Distance of the φ/ψ map (φ < 0 only), ALA 2"
+        assert found.row("phi_jsd").metric == "Distance of φ (φ < 0 only), ALA 2"
         met.add(row.candidate.value)
     assert len(met) == 2
 
@@ -79,7 +83,35 @@ def test_a_state_met_much_too_often_or_never_is_named(simulate: Simulate, per_fr
     assert any(f.startswith("free energy of φ > 0, ALA 2") and f"({said}" in f for f in found.findings), found.findings
 
 
+def test_half_a_visit_is_no_longer_than_what_never_saw_one(alanine_dipeptide: Scene) -> None:
+    """One visit of 1200 frames in the reference: a candidate of 500 frames without any is no more often there."""
+
+    def run(n: int, visited: int = 0) -> Features:
+        phi = np.where(np.arange(n) < visited, 1.0, -1.3)[:, None].astype(np.float32)
+        none = [np.empty((n, 0), dtype=np.float32)]
+        return Features("x", 1.0, [phi], [phi], none, [np.zeros(n, dtype=np.uint16)], None)
+
+    samples = [make_sample(f, make_blocks(f.segment_lengths, 100), Options(), k, 500)
+               for k, f in enumerate((run(8000, 1200), run(500), run(8000)))]  # fmt: skip
+    inputs = ComparisonInput(alanine_dipeptide, backbone(alanine_dipeptide), None, *samples, Options())  # type: ignore[arg-type]
+    row = free_energy_row(inputs, 0, "ALA 2")
+    assert 0.0 < row.candidate.value < row.replicate.value  # type: ignore[union-attr]
+    assert row.replicate.value == pytest.approx(math.log(8000 / 600))  # type: ignore[union-attr]
+
+
+@pytest.mark.parametrize("state", [1, 2])
+def test_a_candidate_in_another_state_is_not_broken(simulate: Simulate, state: int) -> None:
+    """Reference and replicate stay in β, the candidate in α or left-handed: no step to compare, and no fault."""
+    stays = [np.eye(3)[[k] * 3] for k in (0, state)]
+    three = [simulate(k, 1000, transitions=stays[k == 2]) for k in (1, 2, 3)]
+    found = compare(three[0], [three[1]], three[2]).evaluations[0]
+    assert found.status == "undecided" and not [r.key for r in found.rows if r.verdict == "fails"], found.verdict
+    assert dict(found.skipped)["Steps of torsions from frame to frame"] == "the three trajectories share no state"
+    assert "of ψ ALA 2 than the reference" in found.verdict or "φ ALA 2, ψ ALA 2 than" in found.verdict
+    assert "never enters it either" in found.verdict and " 0 times" not in found.verdict
+
+
 def test_a_state_met_often_keeps_its_share_and_its_place_in_the_map(simulate: Simulate) -> None:
     found = compare(simulate(1), [simulate(2)], simulate(3)).evaluations[0]
     assert found.row("population:φ > 0").unit == "%"
-    assert found.row("joint_jsd").metric == "Joint φ/ψ distance, ALA 2"
+    assert found.row("joint_jsd").metric == "Distance of the φ/ψ map, ALA 2"

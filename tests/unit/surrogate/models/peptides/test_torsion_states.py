@@ -108,7 +108,7 @@ def test_numbers_count_from_the_middle_of_the_state_and_come_back() -> None:
     other = (states + torch.tensor([0, 0, 1, 0, 0, 0, 0])) % 3
     moved = (model.middle(other, chain) != model.middle(states, chain))[0]
     assert torch.equal(moved[1], stated) and not moved[[0, 2]].any()
-    back = chain.code.encode(model.frames_of(numbers, states, chain))
+    back = chain.code.encode(chain.code.decode(model._tokens(numbers, states, chain)))
     torch.testing.assert_close(back, chain.code.encode(frames), rtol=0, atol=1e-4)
 
 
