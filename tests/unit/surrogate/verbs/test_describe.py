@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 
+from surrogate.cli.render import print_pairs
 from surrogate.verbs.info import info, intervention_lines
 from surrogate.verbs.run.run_record import Outcome, RunRecord, write_run
 from systems.errors import InputError
@@ -44,3 +45,8 @@ def test_a_folder_of_many_runs_lists_them(tmp_path: Path) -> None:
     found = info(tmp_path)
     assert found["summary"] == "1 of 2 molecules evaluated"
     assert found["molecules"] == {"a": "Close.", "b": "failed: no SMILES"}
+
+
+def test_the_record_of_a_forced_rollout_is_printed(capsys: pytest.CaptureFixture[str]) -> None:
+    print_pairs({"out_of_domain": [{"what": "temperature", "reason": "350 K, trained at 300 K"}]})
+    assert "temperature: 350 K, trained at 300 K" in capsys.readouterr().out
