@@ -20,11 +20,11 @@ from torch import Tensor
 
 from systems.chemistry.geometry import superpose
 from systems.chemistry.graph import molecule_key
-from systems.errors import InputError, TrajectoryError, first_line
+from systems.errors import InputError, TrajectoryError, first_line, listed
 from systems.files.schema import built, parsed
 from systems.files.whole_file import create_whole
 from systems.scene import Scene
-from systems.trajectory.base import TrajectoryReader
+from systems.trajectory.base import TrajectoryReader, uneven_by_ps
 from systems.trajectory.codec import open_trajectory
 from systems.trajectory.joined import refuse_joined
 from systems.trajectory.store import open_hdf5
@@ -304,23 +304,26 @@ def _agreed(paths: list[Path]) -> tuple[Scene, float, dict[str, Any], npt.NDArra
         with open_trajectory(path) as reader:
             refuse_joined(reader)
             steps = np.diff(reader.time_ps)
-            if len(steps) == 0 or not np.allclose(steps, steps[0], rtol=1e-4):
+            step = float(f"{steps.mean():.6g}") if len(steps) else 0.0
+            if len(steps) == 0 or np.abs(steps - step).max() > uneven_by_ps(reader.time_ps, step):
                 raise InputError(f"{path}: frames are not evenly spaced in time; training needs one save interval.")
             found = {key: reader.record.get(key) for key in CONDITIONS}
             if reader.record.get("constrain_hydrogens") is False:
                 found["constrain_hydrogens"] = False
             own = _scene_of(reader)
             if scene is None:
-                scene, lag_ps, conditions = own, float(steps[0]), found
+                scene, lag_ps, conditions = own, step, found
             if own.topology_hash != scene.topology_hash:
                 raise InputError(
                     f"{path} holds another topology than {paths[0]}; one model learns one scene, or several peptides "
                     "(`arch='lam-slide-peptides'`)."
                 )
-            if not np.isclose(steps[0], lag_ps, rtol=1e-4):
-                raise InputError(f"{path} is saved every {steps[0]:g} ps, {paths[0]} every {lag_ps:g} ps.")
+            if not np.isclose(step, lag_ps, rtol=1e-3):
+                raise InputError(f"{path} is saved every {step:g} ps, {paths[0]} every {lag_ps:g} ps.")
             if found != conditions:
-                raise InputError(f"{path} was made under {found}, {paths[0]} under {conditions}.")
+                differ = [key for key in {**conditions, **found} if found.get(key) != conditions.get(key)]
+                one, other = (listed([f"{k} {of.get(k)}" for k in differ]) for of in (found, conditions))
+                raise InputError(f"{path} was made under other conditions ({one}) than {paths[0]} ({other}).")
             lengths.append(reader.n_frames)
     if scene is None:
         raise InputError("no trajectory given to train on.")

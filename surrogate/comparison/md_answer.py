@@ -180,6 +180,11 @@ class Answer:
         enough = (_BY_ITSELF * MODEL_ERROR) ** 2 * len(known)
         return not self.is_sure or bool(self.missing) or sum(known) > enough
 
+    def is_better_than(self, joint: Answer) -> bool:
+        """Whether MD alone, which lacks nothing, states errors no larger than with a surrogate's transitions."""
+        own, both = (sum(s.error**2 for s in a.states) for a in (self, joint))
+        return self.is_sure and not self.missing and own <= both
+
     @property
     def contradicts(self) -> bool:
         """Whether MD contradicts the surrogate whose transitions count with its own."""
@@ -424,7 +429,7 @@ def md_answer(
         return answer
     with suppress(InputError):
         joint = _joint(answer, found, (angles, own), named, torsions, temperature_k, seed)
-        return answer if joint.contradicts else joint
+        return answer if joint.contradicts or answer.is_better_than(joint) else joint
     return answer
 
 

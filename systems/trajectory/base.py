@@ -46,6 +46,12 @@ from systems.trajectory.store import (
 _VERIFIED_AT_ONCE = 4096
 
 
+def uneven_by_ps(time_ps: Float64Array, step_ps: float) -> float:
+    """Return by how much a step between even frames may differ from the others: times that passed through float32 are
+    exact only to its spacing."""
+    return 1e-3 * step_ps + 2.0 * float(np.spacing(np.float32(np.abs(time_ps).max(initial=0.0))))
+
+
 class TrajectoryWriter(FrameStore):
     """Appends frames to one file. Each `append` is whole on disk, or not there at all, when it returns or raises."""
 

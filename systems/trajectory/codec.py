@@ -17,7 +17,7 @@ from systems.chemistry.distance_bonds import lengths_and_angles
 from systems.errors import InputError, TrajectoryError
 from systems.files.whole_file import OutputLock, journal_path
 from systems.scene import Scene
-from systems.trajectory.base import TrajectoryReader, TrajectoryWriter
+from systems.trajectory.base import TrajectoryReader, TrajectoryWriter, uneven_by_ps
 from systems.trajectory.companion_writer import POSITIONS_ALONE, is_our_topology, meta_path, topology_path
 from systems.trajectory.store import PER_ATOM, Float32Array, Float64Array, FrameStore
 from systems.units import GAS_CONSTANT_KJ_MOL_K
@@ -164,8 +164,7 @@ def to_mdanalysis(
     scene, positions, times, cells = _read(source, start, stop, stride)
     gaps = np.diff(times)
     step = float(gaps.mean()) if len(gaps) else 1.0
-    # Times that passed through float32 are exact only to its spacing.
-    if len(gaps) and np.abs(gaps - step).max() > 1e-3 * step + 2 * np.spacing(np.float32(np.abs(times).max())):
+    if len(gaps) and np.abs(gaps - step).max() > uneven_by_ps(times, step):
         raise InputError(f"frames between {times[0]:g} and {times[-1]:g} ps are unevenly spaced; take a range that is.")
     dimensions = None
     if cells is not None:

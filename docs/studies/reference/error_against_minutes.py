@@ -302,36 +302,50 @@ def of_distribution(evaluated: dict[str, Any]) -> dict[str, Any] | None:
     return next((w for w in evaluated["equivalent_time"] if w["kind"] == "distribution"), None)
 
 
+def answer_again(result: RunResult, ref: LongMD | None) -> Answer | None:
+    """Return what the MD of a run, and its rollout, tell by the present program, None where it is nothing."""
+    md = load_ensemble(result.md) if ref is None else ref.load(result.md)
+    rolled = None if result["decision"]["way"] == "md" else load_ensemble(result.trajectory, template=md.scene)
+    try:
+        return md_answer(md, KELVIN, surrogate=rolled, seed=result["settings"]["seed"])
+    except SurromdError:
+        return None
+
+
 def row(name: str, minutes: float, place: Path, ref: LongMD | None) -> dict[str, Any]:
     """Return a line of the table; a way that is not there has no error, and nothing is right without a reference."""
     result = RunResult.of(place / f"{minutes:g}min")
-    answer = result.answer
+    answer = answer_again(result, ref)
+    told = answer.to_dict() if answer else {}
+    converged = answer is not None and answer.holds and not answer.missing
     line: dict[str, Any] = {
         "molecule": name, "minutes": minutes, "way": result["decision"]["way"],
-        "populations by": answer.get("populations_by", ""),
-        "stated": rounded(stated_error(answer)) if answer else None,
-        "verdict": "" if result["outcome"]["converged"] else "not converged",
+        "populations by": told.get("populations_by", ""),
+        "stated": rounded(stated_error(told)) if answer else None,
+        "verdict": "" if converged else "not converged",
     }  # fmt: skip
     if ref is None:
         return line
-    found = errors_of_ways(result, minutes, place, ref)
+    found = errors_of_ways(result, minutes, place, ref, None if answer is None else answer.weights)
     for way, (distance_, populations) in found.items():
         line |= {f"{way}: distance": rounded(distance_), f"{way}: populations": rounded(populations)}
-    held, total = intervals_held(answer, ref.answer)
+    held, total = intervals_held(told, ref.answer)
     line |= {"R-hat": rounded(ref.r_hat), HALVES: rounded(ref.replicate_baseline)}
     line |= {"intervals held": held, "of": total, "equivalent MD time held": equivalent_time_held(result, ref)}
-    if result["outcome"]["converged"]:
+    if converged:
         line["verdict"] = "right" if held >= HELD * total - 1.0 else "wrong"
     return line
 
 
-def errors_of_ways(result: RunResult, minutes: float, place: Path, ref: LongMD) -> dict[str, tuple[float, float]]:
-    """Return for each way that is there the distance of torsions and the error of populations in per cent."""
+def errors_of_ways(
+    result: RunResult, minutes: float, place: Path, ref: LongMD, weights: Sequence[FloatArray] | None
+) -> dict[str, tuple[float, float]]:
+    """Return for each way that is there the distance of torsions and the error of populations in per cent; `weights`
+    of the run's MD."""
     rates = result["rates"]
     md_ps = md_length_ps(rates, minutes)
     found: dict[str, tuple[float, float]] = {}
-    answer = result.answer
-    found["run"] = ref.errors(ref.load(result.md), [sm.frame_weights(f) for f in result.md] if answer else None)
+    found["run"] = ref.errors(ref.load(result.md), weights)
     if one := finished(place / "one"):
         md = ref.load(one, md_ps)
         if len(md.segments[0]) * md.lag_ps > LONG_ENOUGH * md_ps:

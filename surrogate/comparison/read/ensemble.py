@@ -26,7 +26,7 @@ from surrogate.comparison.read.stored_frames import (
 )
 from systems.errors import InputError, OutOfDomainError, TrajectoryError, listed
 from systems.scene import FloatArray, IntArray, Scene, part_of
-from systems.trajectory.base import TrajectoryReader
+from systems.trajectory.base import TrajectoryReader, uneven_by_ps
 from systems.trajectory.codec import DIFFERENCE_COLUMN, open_trajectory, reweighting
 from systems.trajectory.joined import replicas_of
 from systems.units import format_time_ps
@@ -417,9 +417,7 @@ def time_axis(
             f"{path}: its header says {1e3 * measured:.3g} fs between frames, which is what a writer that was told "
             "nothing puts there; state the time between frames with `dt_ps='1ps'`."
         )
-    # Times that passed through float32 are exact only to its spacing.
-    tolerance = 1e-3 * measured + 2.0 * float(np.spacing(np.float32(np.abs(time_ps).max())))
-    odd = np.abs(steps - measured) > tolerance
+    odd = np.abs(steps - measured) > uneven_by_ps(time_ps, measured)
     jump = odd & ((steps <= 0) | (steps >= 1.5 * measured))
     if (odd & ~jump).any() or jump.sum() > 0.02 * len(steps):
         first = int(np.flatnonzero(odd)[0])

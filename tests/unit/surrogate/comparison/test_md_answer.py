@@ -154,6 +154,22 @@ def test_short_md_and_a_surrogate_together_err_less_than_either(forms: np.ndarra
     assert joint < 0.6 * alone and joint < 0.09
 
 
+@pytest.mark.parametrize(("factor", "together"), [(2.0, False), (0.5, True)])
+def test_md_answers_alone_where_a_surrogate_would_make_its_errors_larger(
+    forms: np.ndarray, monkeypatch: pytest.MonkeyPatch, factor: float, together: bool
+) -> None:
+    def joint(answer: Answer, *rest: object) -> Answer:
+        states = tuple(
+            dataclasses.replace(s, md_share=s.share, md_error=s.error, error=factor * s.error) for s in answer.states
+        )
+        return dataclasses.replace(answer, states=states)
+
+    monkeypatch.setattr(told, "_joint", joint)
+    md = ensemble(forms, jumps(MATRIX, [0, 1, 2, 1] * 4, 150, 3))
+    found = md_answer(md, 300.0, surrogate=rolled(forms, MATRIX))
+    assert found.is_sure and not found.missing and found.is_joint == together
+
+
 def _states(frames: np.ndarray) -> np.ndarray:
     from systems.chemistry.geometry import torsion
 

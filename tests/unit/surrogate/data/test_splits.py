@@ -81,6 +81,23 @@ def test_a_trajectory_is_held_out_whole(tmp_path: Path, alanine_dipeptide: Scene
     assert np.array_equal(again.coordinates, frames.coordinates)
 
 
+def test_times_that_passed_through_float32_are_even(tmp_path: Path, alanine_dipeptide: Scene) -> None:
+    def written(name: str, time_ps: np.ndarray, **conditions: float) -> Path:
+        noise = np.random.default_rng(0).normal(0.0, 0.01, (len(time_ps), alanine_dipeptide.n_atoms, 3))
+        with open_writer(tmp_path / name, alanine_dipeptide, {"temperature_k": 300.0, **conditions}) as writer:
+            writer.append(alanine_dipeptide.positions_nm + noise, time_ps)
+        return tmp_path / name
+
+    late = (1e5 + 0.1 * np.arange(50)).astype(np.float32).astype(np.float64)
+    assert np.ptp(np.diff(late)) > 0.005
+    assert collect_frames([written("late.h5", late)]).lag_ps == pytest.approx(0.1, rel=1e-3)
+    with pytest.raises(InputError, match="not evenly spaced"):
+        collect_frames([written("uneven.h5", np.cumsum([1.0, 1.0, 1.0, 1.01, 1.0]))])
+    colder = written("colder.h5", late, temperature_k=280.0)
+    with pytest.raises(InputError, match=r"conditions \(temperature_k 280.0\) than .*late.h5 \(temp\w* 300.0"):
+        collect_frames([tmp_path / "late.h5", colder])
+
+
 def test_frames_beyond_memory_are_mapped(tmp_path: Path, alanine_dipeptide: Scene) -> None:
     path = write(tmp_path / "t.h5", alanine_dipeptide, 20_000)
     kept = collect_frames([path])
