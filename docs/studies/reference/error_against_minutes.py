@@ -1,12 +1,13 @@
 """Error of the final answer against minutes: `surromd run`, MD from one start, MD from many, a rollout alone.
 
     python docs/studies/reference/error_against_minutes.py reference FOLDER [--time 140ns --every 50ps]
+    python docs/studies/reference/error_against_minutes.py longer FOLDER --molecules NAME --time 40ns [--every 50ps]
     python docs/studies/reference/error_against_minutes.py runs FOLDER [--minutes 1 3 10]
     python docs/studies/reference/error_against_minutes.py rivals FOLDER [--minutes 10]
     python docs/studies/reference/error_against_minutes.py table FOLDER [-o TABLE.json] [--figure FIGURE.svg]
 
 `reference` makes FOLDER/NAME/run_000.h5 and on, one batch of SIMD replicas from many starts, frames 10 ps apart, as
-long as its slowest process needs for a split R-hat below 1.05. `runs` spends each budget by `surromd run` in
+long as its slowest process needs for a split R-hat below 1.05; `longer` goes on where that was too short. `runs` spends each budget by `surromd run` in
 FOLDER/NAME/MINUTESmin, on the cores it may use: it alone needs a quiet machine (`taskset -c 0` for one core). `rivals`
 makes MD from one start (NAME/one) and a rollout (NAME/rollout) as long as the whole budget buys by the rates that the
 runs measured, reports and preparation for nothing. MD from many starts is the beginning of the reference, beside the
@@ -33,7 +34,7 @@ import numpy.typing as npt
 
 import surrogate as sm
 from md_reference.run.machine import machine_name
-from md_reference.run.replicas import simulate_replicas
+from md_reference.run.replicas import simulate_batch, simulate_replicas
 from md_reference.simd.force_field import n_replicas
 from surrogate.comparison.convergence import tested_reference
 from surrogate.comparison.equivalent_time import EquivalentTime
@@ -49,6 +50,7 @@ from surrogate.verbs.simulate import resolve_run
 from systems.errors import SurromdError
 from systems.library.named_scenes import prepare
 from systems.trajectory.checkpoint import checkpoint_path
+from systems.trajectory.codec import open_trajectory
 from systems.units import format_time_ps, parse_time_ps
 
 FloatArray = npt.NDArray[np.float64]
@@ -75,6 +77,7 @@ KELVIN, SEED, EVERY_PS, BINS, LEFT_OUT_PS = 300.0, 5_000, 10.0, 50, 5_000.0
 ENOUGH_R_HAT, HELD = 1.05, 0.95
 # MD from one start that ends before this share of the time that a budget buys is none of that budget's.
 LONG_ENOUGH = 0.9
+LONGER = "longer"
 # A rollout is no longer: what it is off by then is the model's.
 ROLLED_MINUTES = 1.0
 
@@ -92,6 +95,25 @@ def make_reference(folder: Path, names: Sequence[str], time_ps: float | None, ev
         scene, config, _ = resolve_run(prepare(source), options, {"time_ps": length_ps}, quiet=True)
         simulate_replicas(scene, config, files, resume=True)
         said(f"{name}: {len(files)} replicas of {format_time_ps(length_ps)}")
+
+
+def make_longer(folder: Path, names: Sequence[str], time_ps: float, every_ps: float) -> None:
+    """Go on from the last frames of every molecule's finished reference, with new velocities."""
+    for name in names:
+        before = finished(folder / name)
+        files = [folder / name / LONGER / path.name for path in before]
+        files[0].parent.mkdir(exist_ok=True)
+        options = ReferenceOptions(
+            time_ps=time_ps, save_every_ps=every_ps, seed=SEED + 500, platform="simd", quiet=True
+        )
+        scene, config, _ = resolve_run(prepare(MOLECULES[name][0]), options, {"time_ps": time_ps}, quiet=True)
+        simulate_batch(scene, config, files, resume=True, starts_nm=np.array([last_frame(path) for path in before]))
+        said(f"{name}: {format_time_ps(time_ps)} more")
+
+
+def last_frame(path: Path) -> FloatArray:
+    with open_trajectory(path) as reader:
+        return np.asarray(reader.read(reader.n_frames - 1, reader.n_frames)[0], dtype=np.float64)
 
 
 def make_runs(folder: Path, names: Sequence[str], minutes: Sequence[float]) -> None:
@@ -176,6 +198,10 @@ class LongMD:
         """Return what files of replicas tell; the first part of each is left out, as hot starts are to be forgotten."""
         whole = load_ensemble(files)
         ensemble = stretch(whole, round(LEFT_OUT_PS / whole.lag_ps), None)
+        if longer := sorted((files[0].parent / LONGER).glob("[!.]*.h5")):
+            later = load_ensemble(longer, template=whole.scene)
+            pairs = zip(ensemble.segments, later.segments, strict=True)
+            ensemble = replace(ensemble, segments=[np.concatenate(pair) for pair in pairs])
         baseline = Baseline.of(ensemble, parent=ensemble.scene, kept=ensemble.kept)
         angles = measured(baseline, ensemble)
         halves = ({k: x[: len(x) // 2] for k, x in angles.items()}, {k: x[len(x) // 2 :] for k, x in angles.items()})
@@ -486,12 +512,14 @@ def said(line: str) -> None:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     verbs = parser.add_subparsers(dest="verb", required=True)
-    parts = {name: verbs.add_parser(name) for name in ("reference", "runs", "rivals", "table")}
+    parts = {name: verbs.add_parser(name) for name in ("reference", "longer", "runs", "rivals", "table")}
     for part in parts.values():
         part.add_argument("folder", type=Path)
         part.add_argument("--molecules", nargs="+", choices=sorted(MOLECULES), default=list(MOLECULES))
     parts["reference"].add_argument("--time", type=lambda text: parse_time_ps(text, "--time"))
-    parts["reference"].add_argument("--every", type=lambda text: parse_time_ps(text, "--every"), default=EVERY_PS)
+    parts["longer"].add_argument("--time", type=lambda text: parse_time_ps(text, "--time"), required=True)
+    for verb in ("reference", "longer"):
+        parts[verb].add_argument("--every", type=lambda text: parse_time_ps(text, "--every"), default=EVERY_PS)
     parts["runs"].add_argument("--minutes", nargs="+", type=float, default=[1.0, 3.0, 10.0])
     parts["rivals"].add_argument("--minutes", type=float, default=10.0)
     parts["table"].add_argument("-o", "--out", type=Path)
@@ -499,6 +527,8 @@ def main() -> None:
     given = parser.parse_args()
     if given.verb == "reference":
         make_reference(given.folder, given.molecules, given.time, given.every)
+    elif given.verb == "longer":
+        make_longer(given.folder, given.molecules, given.time, given.every)
     elif given.verb == "runs":
         make_runs(given.folder, given.molecules, given.minutes)
     elif given.verb == "rivals":
