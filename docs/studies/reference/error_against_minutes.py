@@ -7,14 +7,14 @@
     python docs/studies/reference/error_against_minutes.py table FOLDER [-o TABLE.json] [--figure FIGURE.svg]
 
 `reference` makes FOLDER/NAME/run_000.h5 and on, one batch of SIMD replicas from many starts, frames 10 ps apart, as
-long as its slowest process needs for a split R-hat below 1.05; `longer` goes on where that was too short. `runs` spends each budget by `surromd run` in
-FOLDER/NAME/MINUTESmin, on the cores it may use: it alone needs a quiet machine (`taskset -c 0` for one core). `rivals`
-makes MD from one start (NAME/one) and a rollout (NAME/rollout) as long as the whole budget buys by the rates that the
-runs measured, reports and preparation for nothing. MD from many starts is the beginning of the reference, beside the
-rest of it. What is there is left alone, and what was stopped goes on. `table` lays all beside the reference: mean
-Jensen-Shannon distance of torsions (50 bins), root mean square error of the populations of states, how many 95 %
-intervals of populations, and of equivalent MD time, hold, and whether the verdict is right or "not converged". A
-molecule without a reference (chignolin folds in microseconds) has its verdict alone.
+long as its slowest process needs for a split R-hat below 1.05; `longer` goes on where that was too short. `runs` spends
+each budget by `surromd run` in FOLDER/NAME/MINUTESmin, on the cores it may use: it alone needs a quiet machine
+(`taskset -c 0` for one core). `rivals` makes MD from one start (NAME/one) and a rollout (NAME/rollout) as long as the
+whole budget buys by the rates that the runs measured, reports and preparation for nothing. MD from many starts is the
+beginning of the reference, beside the rest of it. What is there is left alone, and what was stopped goes on. `table`
+lays all beside the reference: mean Jensen-Shannon distance of torsions (50 bins), root mean square error of the
+populations of states, how many 95 % intervals of populations, and of equivalent MD time, hold, and whether the verdict
+is right or "not converged". A molecule without a reference (chignolin folds in microseconds) has its verdict alone.
 """
 
 from __future__ import annotations
