@@ -16,6 +16,7 @@ from systems.errors import InputError, OutOfDomainError, first_line
 from systems.files.outside import UNREADABLE, content
 from systems.files.schema import parsed
 from systems.library.named_scenes import prepare
+from systems.trajectory import joined
 from systems.trajectory.codec import open_trajectory
 from systems.units import format_time_ps
 
@@ -94,16 +95,23 @@ def _trajectory(path: Path) -> dict[str, Any]:
     with open_trajectory(path) as reader:
         times, flags, scene, record = reader.time_ps, reader.flags, reader.scene, dict(reader.record)
         n_frames, n_atoms = reader.n_frames, reader.n_atoms
+    replicas = record.pop(joined.KEY, {}).get("replicas", [])
     lag_ps = float(np.median(np.diff(times))) if n_frames > 1 else None
     span = "" if lag_ps is None else f", {format_time_ps(n_frames * lag_ps)} at {format_time_ps(lag_ps)}"
     cost = record.get("cost") or {}
     wall = f", {cost['wall_s']:.3g} s" if "wall_s" in cost else ""
-    unfinished = " (unfinished)" if record.get("completed") is False else ""
+    asked = f" of {format_time_ps(record['time_ps'])}" if "time_ps" in record else ""
+    unfinished = f" (ended before the end{asked})" if record.get("completed") is False else ""
     return {
         "file": str(path),
         "type": record.get("kind", "foreign") + " trajectory",
         "summary": f"{n_frames} frames of {n_atoms} atoms{span}{wall}{unfinished}",
-        "details": [*summary_lines(record.get("summary") or {}), *rollout_lines(record), *intervention_lines(record)],
+        "details": [
+            *(f"replica: {r['file']}, {r['n_frames']} frames" for r in replicas),
+            *summary_lines(record.get("summary") or {}),
+            *rollout_lines(record),
+            *intervention_lines(record),
+        ],
         "scene": None if scene is None else scene.name,
         "formula": None if scene is None else scene.formula,
         "topology_hash": None if scene is None else scene.topology_hash,

@@ -47,7 +47,7 @@ def join(paths: Sequence[Path], out: Path, *, overwrite: bool = False) -> Path:
         ]
         complete = all(r.record.get("completed") is not False for r in readers)
         common = {key: value for key, value in first.record.items() if all(r.record.get(key) == value for r in readers)}
-        record = common | {KEY: {"replicas": replicas}, "completed": False}
+        record = common | summed_cost([r.record for r in readers]) | {KEY: {"replicas": replicas}, "completed": False}
         next_ps = None
         with open_writer(out, scene, record, overwrite=overwrite, columns=columns) as writer:
             for reader in (r for r in readers if r.n_frames):
@@ -57,6 +57,15 @@ def join(paths: Sequence[Path], out: Path, *, overwrite: bool = False) -> Path:
                 next_ps = float(reader.time_ps[-1]) + shift_ps + interval_ps
             writer.update_record({"completed": complete})
     return out
+
+
+def summed_cost(records: Sequence[Mapping[str, Any]]) -> dict[str, dict[str, float]]:
+    """Return the `cost` of replicas as an entry of a record, each number summed; nothing where one says none."""
+    costs = [c for c in (r.get("cost") for r in records) if isinstance(c, Mapping)]
+    if len(costs) < len(records):
+        return {}
+    numbers = sorted(k for k in costs[0] if all(isinstance(c.get(k), (int, float)) for c in costs))
+    return {"cost": {k: sum(c[k] for c in costs) for k in numbers}}
 
 
 def replicas_of(record: Mapping[str, Any], n_frames: int) -> list[tuple[slice, dict[str, Any]]]:

@@ -28,7 +28,7 @@ from systems.errors import InputError, OutOfDomainError, TrajectoryError, listed
 from systems.scene import FloatArray, IntArray, Scene, part_of
 from systems.trajectory.base import TrajectoryReader, uneven_by_ps
 from systems.trajectory.codec import DIFFERENCE_COLUMN, open_trajectory, reweighting
-from systems.trajectory.joined import replicas_of
+from systems.trajectory.joined import replicas_of, summed_cost
 from systems.units import format_time_ps
 
 Frames = npt.NDArray[np.float32] | StoredFrames
@@ -453,10 +453,5 @@ def merged_record(records: Sequence[dict[str, Any]], label: str, notes: list[str
         values = {str(r.get(key)) for r in records}
         if len(values) > 1:
             notes.append(f"{label}: its files differ in {key} ({', '.join(sorted(values))}).")
-    costs = [c for c in (r.get("cost") for r in records) if isinstance(c, dict)]
     merged.pop("cost", None)
-    if len(costs) == len(records):
-        shared = set.intersection(*(set(c) for c in costs))
-        numbers = sorted(k for k in shared if all(isinstance(c[k], (int, float)) for c in costs))
-        merged["cost"] = {k: sum(c[k] for c in costs) for k in numbers}
-    return merged
+    return merged | summed_cost(records)

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from chain_files import RECORD, SUFFIXES, TOLERANCES, chain, frames, left_behind
+from surrogate.api import info
 from systems.errors import InputError, TrajectoryError
 from systems.trajectory.codec import open_trajectory, open_writer
 from systems.trajectory.joined import KEY, join, replicas_of
@@ -49,6 +50,18 @@ def test_all_frames_are_kept_and_the_record_says_where_replicas_begin(tmp_path: 
         seen = mdtraj.load(str(out), top=str(out.with_suffix(".pdb")))
         np.testing.assert_allclose(seen.xyz, whole, atol=1e-5 + 1.1 * atol)
     assert not [name for name in left_behind(tmp_path) if name.startswith(".")]
+
+
+def test_a_joined_file_costs_what_its_replicas_cost_together(tmp_path: Path) -> None:
+    paths = [tmp_path / f"a_r{k}.h5" for k in range(3)]
+    for k, path in enumerate(paths):
+        replica(path, k)
+        with open_writer(path, chain(N_ATOMS), RECORD | {"seed": k}, append=True) as writer:
+            writer.update_record({"cost": {"wall_s": 2.0, "steps": 10}, "completed": k < 2, "time_ps": 2000.0})
+    told = info(join(paths, tmp_path / "a.h5"))
+    assert "6 s" in told["summary"] and told["record"]["cost"] == {"steps": 30, "wall_s": 6.0}
+    assert told["summary"].endswith("(ended before the end of 2 ns)"), "one of them did"
+    assert told["details"][:3] == [f"replica: a_r{k}.h5, 6 frames" for k in range(3)] and KEY not in told["record"]
 
 
 def test_replicas_that_do_not_go_together_are_refused(tmp_path: Path) -> None:
