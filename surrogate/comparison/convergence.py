@@ -111,7 +111,8 @@ class Convergence:
         if not self.n_replicas:
             return f"too short to test: {self.reasons[0]}."
         if self.converged:
-            return f"{self.length}: no sign that it still depends on where it started."
+            alone = " States that one run never entered do not show." if self.n_replicas == 1 else ""
+            return f"{self.length}: no sign that it still depends on where it started.{alone}"
         more = f"; {len(self.reasons) - _MENTIONED} more" if len(self.reasons) > _MENTIONED else ""
         named = "; ".join(self.reasons[:_MENTIONED])
         return f"{self.length}, not converged: it still depends on where it started ({named}{more})."

@@ -138,3 +138,9 @@ def test_real_runs_of_alanine_dipeptide_pass_and_their_beginnings_do_not(shared_
     assert convergence.tested_reference([runs]).converged
     begun = dataclasses.replace(runs, segments=[s[:300] for s in runs.segments])
     assert not convergence.tested_reference([begun]).converged
+
+
+@pytest.mark.parametrize("n", [1, 2])
+def test_of_one_run_it_is_said_that_states_may_lack(n: int) -> None:
+    found = dataclasses.replace(evaluated(LONG, 0), converged=True, n_replicas=n)
+    assert "no sign" in found.verdict and ("never entered" in found.verdict) == (n == 1)
