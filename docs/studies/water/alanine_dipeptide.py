@@ -3,13 +3,15 @@
     python docs/studies/water/alanine_dipeptide.py scene FOLDER             # solvated, at the mean volume of 1 bar
     python docs/studies/water/alanine_dipeptide.py openmm FOLDER --time 20ns --replicas 3
     python docs/studies/water/alanine_dipeptide.py simd FOLDER --time 60ns
-    python docs/studies/water/alanine_dipeptide.py simd FOLDER --time 60ns --padding 3.3nm    # twice the cell's width
+    python docs/studies/water/alanine_dipeptide.py simd OTHER --time 60ns --padding 2nm    # twice as far between images
     python docs/studies/water/alanine_dipeptide.py table FOLDER    # simd_r*.h5, supercell.py's solute_r*.h5
+    python docs/studies/water/alanine_dipeptide.py table FOLDER --control OTHER -o TABLE.json
 
 A run that was stopped goes on. `table` leaves out the first 200 ps of each replica: share of psi in the alpha basin
 (-120 to 80 degrees), the integral of the autocorrelation of cos psi and cos phi up to where it falls below 0.05, and
-the Jensen-Shannon distance (natural logarithm, square root) of phi/psi maps of 36 x 36 bins, each of as many replicas
-as half of the smaller set has, mean over random draws. Errors are over replicas, one left out after the other.
+the Jensen-Shannon distance (natural logarithm, square root) of phi/psi maps of 36 x 36 bins, each of the last part, as
+long in both, of as many replicas as half of the smaller set has, mean over random draws. Errors are over replicas, one
+left out after the other.
 """
 
 from __future__ import annotations
@@ -105,8 +107,8 @@ def apart(one: Sequence[FloatArray], other: Sequence[FloatArray], n: int) -> str
     return f"{np.mean(found):.3f} ± {np.std(found):.3f}"
 
 
-def make_table(folder: Path, out: Path) -> None:
-    sets = {"OpenMM": angles_of(folder, "solute"), "SIMD": angles_of(folder, "simd")}
+def make_table(sets: dict[str, list[FloatArray]], machine: str, out: Path, *, is_control: bool) -> None:
+    """Lay a set of runs beside another, which is the reference."""
     half = min(map(len, sets.values())) // 2
     measures: dict[str, Callable[[Sequence[FloatArray]], float]] = {
         "psi in the alpha basin, %": lambda runs: 100 * float(is_alpha(np.concatenate(runs)[:, 1]).mean()),
@@ -114,12 +116,13 @@ def make_table(folder: Path, out: Path) -> None:
         "cos phi remembered, ps": lambda runs: memory_ps([np.cos(x[:, 0]) for x in runs]),
     }
     rows = [[name, *(with_error(of, runs) for runs in sets.values())] for name, of in measures.items()]
-    openmm, simd = sets.values()
-    name = f"phi/psi maps of {half} replicas, distance from OpenMM's"
-    rows.append([name, apart(openmm, openmm, half), apart(openmm, simd, half)])
+    last = min(len(x) for runs in sets.values() for x in runs)
+    one, other = ([x[-last:] for x in runs] for runs in sets.values())
+    name = f"phi/psi maps of {half} replicas, distance from the first column's"
+    rows.append([name, apart(one, one, half), apart(one, other, half)])
     table = {
-        "command": "python docs/studies/water/alanine_dipeptide.py table FOLDER",
-        "machine": f"SIMD: {machine_name()}; OpenMM: OpenCL, one H200 GPU",
+        "command": "python docs/studies/water/alanine_dipeptide.py table FOLDER" + " --control OTHER" * is_control,
+        "machine": machine,
         "note": "; ".join(f"{name}: {len(runs)} x {len(runs[0]) / 1e3:.2f} ns" for name, runs in sets.items()),
         "columns": ["", *sets],
         "rows": rows,
@@ -134,10 +137,17 @@ def main() -> None:
     parser.add_argument("--time", default="20ns")
     parser.add_argument("--replicas", type=int, default=0, help="0: 3 by OpenMM, a batch by SIMD")
     parser.add_argument("--padding", help="distance between images, in a cell of its own at the volume of 1 bar")
+    parser.add_argument("--control", type=Path, help="table: runs in another cell, instead of OpenMM's")
     parser.add_argument("-o", "--out", type=Path, default=Path("docs/results/tables/water_alanine_dipeptide.json"))
     args = parser.parse_args()
     if args.what == "table":
-        make_table(args.folder, args.out)
+        simd, machine = angles_of(args.folder, "simd"), f"SIMD: {machine_name()}"
+        if args.control is None:
+            sets = {"OpenMM": angles_of(args.folder, "solute"), "SIMD": simd}
+            machine += "; OpenMM: OpenCL, one H200 GPU"
+        else:
+            sets = {"1 nm between images": simd, "2 nm between images": angles_of(args.control, "simd")}
+        make_table(sets, machine, args.out, is_control=args.control is not None)
         return
     args.folder.mkdir(parents=True, exist_ok=True)
     path = args.folder / "scene.json"
