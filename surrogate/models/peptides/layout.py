@@ -257,7 +257,8 @@ class PeptideConfig(ModelConfig):
     shown. `innovation`: the flow runs on innovations, else on the coordinates themselves. `conditioning_noise`: added
     to the given frame in training, in standard deviations. `turning_weight`: what a torsion's numbers count in the loss
     beside a stiff one. `usual_steps`, `usual_solver`: of rollouts; those that the flow was taught, if it was distilled.
-    Flow times are logit-normal, as elsewhere."""
+    `coupled`: neighbours' types and new states count in full when states are drawn (`StateJumps`). Flow times are
+    logit-normal, as elsewhere."""
 
     width: int = 128
     n_layers: int = 6
@@ -272,6 +273,7 @@ class PeptideConfig(ModelConfig):
     usual_solver: str = "gaussian"
     tau_location: float = 0.5
     tau_scale: float = 1.4
+    coupled: bool = False
     types: tuple[str, ...] = ()
     scale: chains.ChainScale | None = None
 

@@ -37,6 +37,9 @@ _WAVES = 8
 _RARELY = -5.0
 # A step of training moves the probabilities by so many times as much as another parameter.
 _FAST = 10.0
+# Residues further apart along the chain are alike far.
+_FAR = 6
+_COUPLED_BLOCKS, _COUPLED_HEADS = 2, 4
 
 
 class StateJumps(nn.Module):
@@ -45,10 +48,14 @@ class StateJumps(nn.Module):
     They follow from the residue's type, its numbers in the given frame, its and its two neighbours' states in that and
     in the frame before, its own in the one before that, the new states of its torsions before this one, and both times.
     Of neighbours' types only levels are learned, which add up: else the network would know each pair of training.
+
+    `coupled`, for trainings on many more sequences: neighbours' types count in full, attention over residues mixes what
+    the given frame tells, and every other residue sees the new states of those beside it, which are drawn first.
     """
 
-    def __init__(self, n_slots: int, n_types: int) -> None:
+    def __init__(self, n_slots: int, n_types: int, *, coupled: bool = False) -> None:
         super().__init__()
+        self.coupled = coupled
         n_states = MOST_TORSIONS * MOST_STATES
         self.of_numbers = nn.Linear(n_slots, _WIDTH, bias=False)
         self.of_given = nn.ModuleList(nn.Linear(n_states, _WIDTH, bias=False) for _ in range(3))
@@ -67,13 +74,41 @@ class StateJumps(nn.Module):
         self.beside_change = nn.Parameter(torch.zeros(2, n_types, MOST_TORSIONS, MOST_STATES, MOST_STATES))
         nn.init.zeros_(self.logits.weight)
         nn.init.constant_(self.logits.bias, _RARELY)
+        if coupled:
+            self.of_type_beside = nn.ModuleList(nn.Embedding(n_types, _WIDTH) for _ in range(2))
+            self.blocks = nn.ModuleList(ParallelBlock(_WIDTH, _COUPLED_HEADS) for _ in range(_COUPLED_BLOCKS))
+            self.of_distance = nn.Embedding(2 * _FAR + 1, _COUPLED_HEADS)
+            self.of_new_beside = nn.ModuleList(nn.Linear(n_states, _WIDTH, bias=False) for _ in range(2))
+
+    @property
+    def turns(self) -> tuple[slice, ...]:
+        """The residues whose new states are drawn at once, one part after the other."""
+        return (slice(0, None, 2), slice(1, None, 2)) if self.coupled else (slice(None),)
 
     def of_observed(self, observed: Tensor, states: Tensor, places: Tensor, counts: Tensor) -> Tensor:
         """What all frames of a chunk have in common: `observed` (b, r, slots), its `states` (b, r, MOST_TORSIONS),
         `places` (r, 3) -> (b, r, width)."""
         beside = _beside(conditioning_states(states, counts))
         h: Tensor = sum((of(x) for of, x in zip(self.of_given, beside, strict=True)), self.of_numbers(observed.float()))
-        return h + self.of_type(places[:, 0])
+        h = h + self.of_type(places[:, 0])
+        if self.coupled:
+            h = h + sum(of(places[:, 1 + k]) for k, of in enumerate(self.of_type_beside))
+            bias = self.of_distance(distances_along(len(places), h.device)).permute(2, 0, 1)
+            still = h.new_zeros(len(h), 3, _WIDTH)
+            for block in self.blocks:
+                h = block(h[:, None], still, None, bias=bias)[0][:, 0]
+        return h
+
+    def of_new_states(self, conditioning: Tensor) -> Tensor | float:
+        """What every other residue sees of the new states beside it: `conditioning` (b, t, r, n) of the new frame ->
+        (b, t, r, width), zero for the residues of the first turn."""
+        if not self.coupled:
+            return 0.0
+        found: Tensor = sum(
+            (of(x) for of, x in zip(self.of_new_beside, _beside(conditioning)[1:], strict=True)),
+            conditioning.new_zeros(()),
+        )
+        return found * (torch.arange(found.shape[-2], device=found.device) % 2)[:, None]
 
     def of_times_alone(
         self, times_ps: Tensor, apart_ps: Tensor, places: Tensor, counts: Tensor
@@ -134,6 +169,7 @@ class StateJumps(nn.Module):
             h = self.of_frames(conditioning_states(before, counts), conditioning_states(earlier, counts))
             h = h + of_times[:, :, None] + self.of_observed(observed, states[:, 0], places, counts)[:, None]
             conditioning = conditioning_states(new, counts)
+            h = h + self.of_new_states(conditioning)
             total = observed.new_zeros(())
             for torsion in torch.nonzero((counts > 0).any(0))[:, 0].tolist():
                 has = counts[:, torsion] > 0
@@ -162,14 +198,18 @@ class StateJumps(nn.Module):
                 at = slice(k, k + 1)
                 h = self.of_frames(conditioning, before) + common[:, at]
                 new, before, conditioning = torch.zeros_like(now), conditioning, torch.zeros_like(conditioning)
-                for torsion in torsions:
-                    logits = self.probabilities(torsion, h, levels[:, at], now[..., torsion], conditioning)
-                    share = logits.softmax(-1).cumsum(-1)
-                    # Shares may end below one by rounding.
-                    drawn = (uniform[:, at, :, torsion, None] >= share[..., :-1]).sum(-1).minimum(most[:, torsion])
-                    new[..., torsion] = drawn
-                    own = slice(torsion * MOST_STATES, (torsion + 1) * MOST_STATES)
-                    conditioning[..., own] = ones[residues, torsion, drawn]
+                for part in self.turns:
+                    seen = (h + self.of_new_states(conditioning))[..., part, :]
+                    for torsion in torsions:
+                        logits = self.probabilities(
+                            torsion, seen, levels[:, at, :, part], now[..., part, torsion], conditioning[..., part, :]
+                        )
+                        share = logits.softmax(-1).cumsum(-1)
+                        # Shares may end below one by rounding.
+                        drawn = (uniform[:, at, part, torsion, None] >= share[..., :-1]).sum(-1)
+                        new[..., part, torsion] = drawn.minimum(most[part, torsion])
+                        own = slice(torsion * MOST_STATES, (torsion + 1) * MOST_STATES)
+                        conditioning[..., part, own] = ones[residues[part], torsion, new[..., part, torsion]]
                 found.append(new)
                 now = new
             return torch.cat(found, dim=1)
@@ -179,6 +219,12 @@ def times_apart(times_ps: Tensor, forgotten_ps: float) -> Tensor:
     """Return the time `(b, t)` between each frame and the one before it; frames of endless times know none before."""
     before = torch.cat([torch.zeros_like(times_ps[:, :1]), times_ps[:, :-1]], dim=1)
     return torch.where(times_ps >= forgotten_ps, times_ps, times_ps - before)
+
+
+def distances_along(n: int, device: torch.device) -> Tensor:
+    """Return how far `n` residues are apart along the chain, as numbers from 0 to 2 * _FAR, `(n, n)`."""
+    place = torch.arange(n, device=device)
+    return (place[:, None] - place).clamp(-_FAR, _FAR) + _FAR
 
 
 def _beside(x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -202,8 +248,6 @@ def generators(noise: Tensor, place: int, attempt: int = 0) -> list[torch.Genera
     return found
 
 
-# Residues further apart along the chain are alike far.
-_FAR = 6
 _MOST_CORRELATED = 0.995
 _LONGEST_WAVE = 4.0
 # Chunks that disobey the states that were drawn for them, or whose atoms overlap, are drawn again so often.
@@ -295,8 +339,7 @@ class PeptideFlow(nn.Module):
         of_states = self.of_states(states, types)
         of_type: Tensor = sum((table(places[:, k]) for k, table in enumerate(self.of_type)), torch.zeros(()))
         angles = rotary_angles(times_ps.shape[1] + 1, self.config.width // self.config.n_heads).to(observed.device)
-        place = torch.arange(len(types), device=observed.device)
-        apart = (place[:, None] - place).clamp(-_FAR, _FAR) + _FAR
+        apart = distances_along(len(types), observed.device)
         given = self.of_known(observed[:, None], types) + of_states[:, :1] + self.of_given
         of_frames = self._of_times(times_ps)[:, :, None] + of_states[:, 1:]
         biases = [cast(PeptideLayer, layer).of_distance(apart).permute(2, 0, 1) for layer in self.layers]
@@ -344,7 +387,7 @@ class PeptideSlide(Propagator):
         self.usual_steps = config.usual_steps
         n_types, n_slots = len(config.types) + len(ENDS), config.scale.n_slots
         self.flow = PeptideFlow(config, n_slots)
-        self.jumps = StateJumps(n_slots, n_types)
+        self.jumps = StateJumps(n_slots, n_types, coupled=config.coupled)
         self.lag_range_ps = config.shortest_ps, config.longest_ps
         self.lag_ps = config.shortest_ps
         self.token_mean = nn.Buffer(torch.zeros(n_types, MOST_STATES, n_slots))

@@ -127,7 +127,7 @@ def _log_probabilities(model: PeptideSlide, phi: Phi, state: int) -> Tensor:
     counts, before, found = chain.stated.counts, now[:, None], []
     conditioning = chains.conditioning_states(before, counts)
     common = model.jumps.of_observed(observed, now, chain.places, counts)[:, None]
-    common = common + model.jumps.of_frames(conditioning, conditioning)
+    common = common + model.jumps.of_frames(conditioning, conditioning) + model.jumps.of_new_states(conditioning)
     for time_ps in _TIMES_PS:
         times = torch.full((len(observed), 1), time_ps, device=observed.device)
         apart = times_apart(times, model.config.forgotten_ps)

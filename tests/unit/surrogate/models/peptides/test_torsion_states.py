@@ -410,3 +410,42 @@ def _turned_deg(chain: ChainFeatures, before: torch.Tensor, after: torch.Tensor)
     quads = torch.tensor(chain.code.layout.turning)
     angles = [dihedral(*(x[..., quads[:, k], :] for k in range(4))) for x in (before, after)]
     return ((angles[1] - angles[0]).rad2deg() + 180.0).remainder(360.0).sub(180.0).abs()
+
+
+@pytest.mark.parametrize("coupled", [True, False])
+def test_torsions_of_neighbours_that_turn_together_are_drawn_together(coupled: bool) -> None:
+    """The second residue's torsion is always in the state that the first one's has just turned to."""
+    torch.manual_seed(0)
+    net, counts = StateJumps(6, 4, coupled=coupled), _counts([2], [2], [2])
+    places, n, frames = torch.tensor([[2, 0, 3], [3, 2, 2], [2, 3, 1]]), 256, 4
+    optimiser = torch.optim.Adam(net.parameters(), lr=0.01)
+    generator = torch.Generator().manual_seed(1)
+    time = torch.ones(n, frames)
+    for _ in range(150):
+        states = torch.zeros(n, 1 + frames, 3, MOST_TORSIONS, dtype=torch.long)
+        states[:, :, [0, 2], 0] = torch.randint(2, (n, 1 + frames, 2), generator=generator)
+        states[:, :, 1, 0] = states[:, :, 0, 0]
+        loss = net.loss(torch.zeros(n, 3, 6), states, places, counts, time, time)
+        optimiser.zero_grad()
+        loss.backward()
+        optimiser.step()
+    uniform = torch.rand(n, 20, 3, MOST_TORSIONS, generator=generator)
+    with torch.no_grad():
+        drawn = net.draw(torch.zeros(n, 3, 6), states[:, 1], places, counts, *(torch.ones(n, 20),) * 2, uniform)
+    first, second, third = drawn[..., 0].unbind(-1)
+    assert float((first == third).double().mean()) == pytest.approx(0.5, abs=0.05), "these know nothing of each other"
+    assert float((first == second).double().mean()) == pytest.approx(1.0 if coupled else 0.5, abs=0.05)
+
+
+def test_the_given_frame_reaches_residues_that_are_not_neighbours_where_states_are_coupled() -> None:
+    torch.manual_seed(0)
+    places, counts = torch.tensor([[2, 0, 3], [3, 2, 2], [2, 3, 3], [3, 2, 1]]), _counts([2], [2], [2], [2])
+    observed = torch.randn(1, 4, 6)
+    other = observed + torch.tensor([0.0, 0.0, 0.0, 1.0])[:, None]
+    states = torch.zeros(1, 4, MOST_TORSIONS, dtype=torch.long)
+    for coupled in (True, False):
+        net = StateJumps(6, 4, coupled=coupled).requires_grad_(False)
+        for block in getattr(net, "blocks", ()):
+            block.offset.fill_(1.0)
+        one, two = (net.of_observed(x, states, places, counts)[0, 0] for x in (observed, other))
+        assert torch.equal(one, two) != coupled
