@@ -21,6 +21,8 @@ from peptide_list import (
     TEST_PAIRS,
     held_out_peptides,
     training_peptides,
+    unseen_peptides,
+    wide_peptides,
 )
 
 from systems.prepare.peptide import build_peptide
@@ -43,6 +45,16 @@ def test_no_test_molecule_is_trained_on() -> None:
     assert not trained & tested
     # A pair with free termini would teach the capped one, and a free chain the capped one of the same residues.
     assert not {r for r, _ in trained} & {r for r, _ in tested}
+
+
+def test_no_molecule_that_tests_is_in_the_wide_campaign() -> None:
+    wide, unseen = wide_peptides(), unseen_peptides()
+    assert len({p.name for p in wide}) == len(wide) == 22 + 300 + 200 and len({p.name for p in unseen}) == len(unseen)
+    assert not {p.residues for p in wide} & {p.residues for p in unseen if len(p.residues) > 1}
+    assert sum(not p.capped for p in wide) == 68 and wide_peptides() == wide
+    assert sum(not p.capped and len(p.residues) == 4 for p in unseen) == 12
+    missing = {r for p in unseen for r in p.residues} - {r for p in wide for r in p.residues}
+    assert not missing
 
 
 def test_metadynamics_fills_the_basins_and_not_the_clash() -> None:

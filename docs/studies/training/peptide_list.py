@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import random
 from dataclasses import dataclass
+from itertools import product
 
 # Amino acids with their protonation states, as the library has them capped.
 RESIDUES = (
@@ -23,6 +24,17 @@ FURTHER_PAIRS = (
     ("GLY", "PRO"), ("VAL", "PRO"), ("SER", "PRO"), ("LEU", "PRO"), ("LYS", "PRO"), ("GLU", "PRO"), ("ASN", "PRO"),
     ("PHE", "PRO"), ("LYS", "ASP"), ("ASP", "LYS"), ("ARG", "GLU"), ("GLU", "ARG"), ("GLU", "LYS"), ("ARG", "ASP"),
 )  # fmt: skip
+# Others that are tested by, in OBC2 and in water (`docs/studies/reference/error_against_minutes.py` has some of them).
+UNSEEN_PAIRS = (
+    ("GLN", "ILE"), ("TYR", "ASP"), ("THR", "PHE"), ("ARG", "ALA"), ("MET", "LEU"), ("ILE", "LYS"),
+)  # fmt: skip
+UNSEEN_CHAINS = (
+    ("TYR", "THR", "GLY"), ("ASN", "ALA", "LEU"), ("VAL", "SER", "GLU", "PHE"), ("LEU", "ALA", "LEU"),
+    ("GLN", "TRP", "SER"), ("GLU", "ILE", "ARG"), ("PRO", "VAL", "THR", "LYS"),
+)  # fmt: skip
+UNSEEN_FREE = (("GLY", "VAL"), ("ALA", "TYR"))
+_UNSEEN_TETRAPEPTIDES = 11
+_WIDE_PAIRS, _WIDE_CHAINS, _WIDE_SEED = 300, 200, 43
 _TEST_STARTS = 16
 _PAIR_ROUNDS = 3
 _CHAINS = 12
@@ -82,6 +94,35 @@ def held_out_peptides() -> tuple[Peptide, ...]:
         *(Peptide((residue,), True, _TEST_STARTS, 50_000.0) for residue in TEST_MONOMERS),
         *(Peptide(residues, True, _TEST_STARTS, 10_000.0) for residues in TEST_CHAINS),
         *(Peptide(residues, False, _TEST_STARTS, 10_000.0) for residues in TEST_FREE_CHAINS),
+    )
+
+
+def unseen_tetrapeptides() -> list[tuple[str, ...]]:
+    """Return tetrapeptides with free ends for MDGen's metrics, beside the one of TEST_FREE_CHAINS."""
+    return _chains(random.Random(_WIDE_SEED), {*TEST_FREE_CHAINS}, lengths=(4,), n=_UNSEEN_TETRAPEPTIDES)
+
+
+def wide_peptides() -> tuple[Peptide, ...]:
+    """Return the molecules of the wide campaign, by which states of torsions may be coupled along the chain: monomers,
+    pairs, chains of three to five residues, a third of these with free ends; sixteen runs of 3 ns each."""
+    rng = random.Random(_WIDE_SEED)
+    tested = {*TEST_PAIRS, *UNSEEN_PAIRS, *TEST_CHAINS, *UNSEEN_CHAINS, *TEST_FREE_CHAINS, *UNSEEN_FREE}
+    tested |= {*unseen_tetrapeptides()}
+    pairs = rng.sample([pair for pair in product(RESIDUES, repeat=2) if pair not in tested], _WIDE_PAIRS)
+    chains = _chains(rng, tested, lengths=(3, 4, 5), n=_WIDE_CHAINS)
+    capped = [Peptide(p, True, _TEST_STARTS, 3000.0) for p in (*((r,) for r in RESIDUES), *pairs)]
+    return (*capped, *(Peptide(p, k // 3 % 3 != 0, _TEST_STARTS, 3000.0) for k, p in enumerate(chains)))
+
+
+def unseen_peptides() -> tuple[Peptide, ...]:
+    """Return what the wide campaign tests by: 12 pairs, 4 monomers, 12 capped and 14 free chains."""
+    pairs, capped = (*TEST_PAIRS, *UNSEEN_PAIRS), (*TEST_CHAINS, *UNSEEN_CHAINS)
+    free = (*UNSEEN_FREE, TEST_FREE_CHAINS[0], *unseen_tetrapeptides())
+    return (
+        *(Peptide(pair, True, _TEST_STARTS, 20_000.0) for pair in pairs),
+        *(Peptide((residue,), True, _TEST_STARTS, 20_000.0) for residue in (*TEST_MONOMERS, "TYR")),
+        *(Peptide(chain, True, _TEST_STARTS, 10_000.0) for chain in capped),
+        *(Peptide(chain, False, _TEST_STARTS, 10_000.0) for chain in free),
     )
 
 

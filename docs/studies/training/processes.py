@@ -9,7 +9,7 @@ import multiprocessing
 import os
 import sys
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -24,13 +24,18 @@ from systems.trajectory.companion_writer import topology_path
 from systems.units import parse_wall_s
 
 
-def arguments_of(about: str | None, switch: str, help: str, given: Sequence[str] | None) -> argparse.Namespace:
-    """Read the command line that these commands have in common, and one switch of their own."""
+def arguments_of(
+    about: str | None, switch: str, help: str, given: Sequence[str] | None, solvents: Collection[str] = ()
+) -> argparse.Namespace:  # fmt: skip
+    """Read the command line that these commands have in common, one switch of their own, and the solvent where there
+    is a choice, by default the first."""
     parser = argparse.ArgumentParser(description=about, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folder", type=Path)
     parser.add_argument("--budget", default="3h", help="wall time after which no further run is begun")
     parser.add_argument("--workers", type=int, default=available_cores())
     parser.add_argument(switch, action="store_true", help=help)
+    if solvents:
+        parser.add_argument("--solvent", choices=list(solvents), default=next(iter(solvents)))
     chosen = parser.parse_args(given)
     chosen.budget_s = parse_wall_s(chosen.budget, "--budget")
     return chosen

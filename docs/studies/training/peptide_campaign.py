@@ -1,12 +1,13 @@
-"""Peptides in TIP3P water by SIMD replicas: what a model in explicit solvent learns from and is tested on.
+"""Peptides by SIMD replicas, in TIP3P water or in OBC2: what models learn from and are tested on.
 
-    python docs/studies/training/peptides_in_water.py FOLDER --budget 3h [--workers 1]
-    python docs/studies/training/peptides_in_water.py FOLDER --list
+    python docs/studies/training/peptide_campaign.py FOLDER --budget 3h [--workers 1] [--solvent obc2]
+    python docs/studies/training/peptide_campaign.py FOLDER --list [--solvent obc2]
 
-ff14SB, 300 K, NVT at the volume of 1 bar, PME, 4 fs, frames 1 ps apart without water. Each batch is sixteen runs
-`FOLDER/{test,train}/NAME/run_000.h5`, ... that begin in other states: sixteen replicas in OBC2, 200 ps at 500 K and 500
-ps at 300 K, whose torsions the replicas in water are turned to; 50 ps after that are left out. Rounds of the test set
-and of the training set by turns, the test set first. What is there is left alone and what was stopped goes on.
+ff14SB, 300 K, 4 fs. Each batch is sixteen runs `FOLDER/{test,train}/NAME/run_000.h5`, ... that begin in other states:
+sixteen replicas in OBC2, 200 ps at 500 K and 500 ps at 300 K. In water (NVT at the volume of 1 bar, PME, frames 1 ps
+apart without water) the replicas are turned to the torsions of these; in OBC2 (the wide campaign, frames 5 ps apart)
+they go on from them. 50 ps after that are left out. The test set first, then what is trained on, in water in rounds.
+What is there is left alone and what was stopped goes on.
 """
 
 from __future__ import annotations
@@ -14,11 +15,12 @@ from __future__ import annotations
 import sys
 import zlib
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from peptide_list import Peptide, training_peptides
+from peptide_list import Peptide, training_peptides, unseen_peptides, wide_peptides
 from processes import arguments_of, in_order, only_here, parts_of, run_path, simulate_runs
 
 from md_reference.forces.forcefield import build_system
@@ -41,6 +43,7 @@ TEST = (
     *(Peptide(chain, False, 16, 3000.0) for chain in (("ILE", "GLN", "ALA", "PHE"), ("MET", "SER"))),
 )
 TRAINING_PS, ROUNDS, DISCARDED_PS = 1000.0, 6, 50.0
+SAVED_PS = {"tip3p": 1.0, "obc2": 5.0}
 HOT_K, HOT_PS, COOL_PS = 500.0, 200.0, 500.0
 TURNED_PS, STIFFNESS_KJ_MOL = 20.0, 300.0
 
@@ -57,8 +60,8 @@ def minimised(scene: Scene, spec: ForceFieldSpec, system: Any) -> FloatArray:
         return engine.positions()
 
 
-def many_states(dry: Scene, quads: IntArray, seed: int) -> FloatArray:
-    """Return the torsions `(n_replicas, k)` of replicas in OBC2 that were hot and have cooled down."""
+def many_states(dry: Scene, seed: int) -> FloatArray:
+    """Return positions `(n_replicas, n_atoms, 3)` of replicas in OBC2 that were hot and have cooled down."""
     system = build_system(dry, IMPLICIT)
     start = minimised(dry, IMPLICIT, system)
     hot = dynamics(system, HOT_K, seed)
@@ -69,7 +72,7 @@ def many_states(dry: Scene, quads: IntArray, seed: int) -> FloatArray:
     cool.set_positions(hot.positions_nm)
     cool.thermalise()
     cool.step(round(COOL_PS / cool.timestep_ps))
-    return torsion(cool.positions_nm, quads)
+    return cool.positions_nm
 
 
 def starts_in_water(wet: Scene, quads: IntArray, angles: FloatArray, seed: int) -> FloatArray:
@@ -86,7 +89,7 @@ def starts_in_water(wet: Scene, quads: IntArray, angles: FloatArray, seed: int) 
     return run.positions_nm
 
 
-def batch(folder: Path, peptide: Peptide, number: int) -> None:
+def batch(folder: Path, peptide: Peptide, number: int, solvent: str) -> None:
     """Simulate the batch of this number, from wherever it stands. Raises SimulationError, KeyboardInterrupt."""
     numbers = range(number * n_replicas(), (number + 1) * n_replicas())
     if all(run_path(folder, k).exists() for k in numbers):
@@ -95,20 +98,26 @@ def batch(folder: Path, peptide: Peptide, number: int) -> None:
         if not free:
             return
         dry = build_peptide(peptide.sequence)
-        wet = solvate(dry, WATER, WaterBox())
-        seed = zlib.crc32(f"water:{peptide.name}:{number}".encode()) % (2**31 - 2)
+        in_water = solvent == WATER.solvent
+        scene = solvate(dry, WATER, WaterBox()) if in_water else dry
+        seed = zlib.crc32(f"{'water' if in_water else solvent}:{peptide.name}:{number}".encode()) % (2**31 - 2)
         starts = None
         if not any(part.exists() for part in parts_of(folder, numbers)):
-            quads = rotatable_torsions(dry)
-            starts = starts_in_water(wet, quads, many_states(dry, quads, seed), seed)
+            starts = many_states(dry, seed)
+            if in_water:
+                quads = rotatable_torsions(dry)
+                starts = starts_in_water(scene, quads, np.asarray(torsion(starts, quads), dtype=np.float64), seed)
         config = MDConfig(
-            force=WATER, time_ps=peptide.time_ps, equilibrate_ps=DISCARDED_PS, seed=seed, platform=SIMD, keep="solute"
-        )
-        simulate_runs(wet, config, folder, numbers, starts_nm=starts)
+            force=WATER if in_water else IMPLICIT, time_ps=peptide.time_ps, equilibrate_ps=DISCARDED_PS, seed=seed,
+            platform=SIMD, keep="solute" if in_water else "all", save_every_ps=SAVED_PS[solvent],
+        )  # fmt: skip
+        simulate_runs(scene, config, folder, numbers, starts_nm=starts)
 
 
-def order() -> list[tuple[str, Peptide, int]]:
+def order(solvent: str) -> list[tuple[str, Peptide, int]]:
     """Return every batch: where its files go, the molecule and the number."""
+    if solvent == IMPLICIT.solvent:
+        return [(kind, p, 0) for kind, some in (("test", unseen_peptides()), ("train", wide_peptides())) for p in some]
     training = [Peptide(p.residues, p.capped, p.n_starts, TRAINING_PS) for p in training_peptides()]
     return [
         (kind, peptide, number)
@@ -118,20 +127,20 @@ def order() -> list[tuple[str, Peptide, int]]:
     ]
 
 
-def make(task: tuple[str, Peptide, int], deadline: float, folder: str) -> None:
+def make(task: tuple[str, Peptide, int], deadline: float, folder: str, solvent: str) -> None:
     kind, peptide, number = task
-    batch(Path(folder) / kind / peptide.name, peptide, number)
+    batch(Path(folder) / kind / peptide.name, peptide, number, solvent)
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    chosen = arguments_of(__doc__, "--list", "print what is there and simulate nothing", arguments)
+    chosen = arguments_of(__doc__, "--list", "print what is there and simulate nothing", arguments, solvents=SAVED_PS)
     if chosen.list:
-        for kind, peptide, number in order():
+        for kind, peptide, number in order(chosen.solvent):
             done = len(list((chosen.folder / kind / peptide.name).glob("run_*.h5"))) - number * n_replicas()
             if done > 0:
                 sys.stdout.write(f"{kind} {peptide.name} {min(done, n_replicas())} x {peptide.time_ps:g} ps\n")
         return
-    in_order(order, make, chosen.budget_s, chosen.workers, str(chosen.folder))
+    in_order(partial(order, chosen.solvent), make, chosen.budget_s, chosen.workers, str(chosen.folder), chosen.solvent)
 
 
 if __name__ == "__main__":
