@@ -7,11 +7,11 @@
     python docs/studies/water/alanine_dipeptide.py table FOLDER    # simd_r*.h5, supercell.py's solute_r*.h5
     python docs/studies/water/alanine_dipeptide.py table FOLDER --control OTHER -o TABLE.json
 
-A run that was stopped goes on. `table` leaves out the first 200 ps of each replica: share of psi in the alpha basin
-(-120 to 80 degrees), the integral of the autocorrelation of cos psi and cos phi up to where it falls below 0.05, and
-the Jensen-Shannon distance (natural logarithm, square root) of phi/psi maps of 36 x 36 bins, each of the last part, as
-long in both, of as many replicas as half of the smaller set has, mean over random draws. Errors are over replicas, one
-left out after the other.
+A run that was stopped goes on. `table` leaves out the first 200 ps of each replica, and replicas that cross to phi > 0,
+where they stay longer than these runs last: share of psi in the alpha basin (-120 to 80 degrees), the integral of the
+autocorrelation of cos psi and cos phi up to where it falls below 0.05, and the Jensen-Shannon distance (natural
+logarithm, square root) of phi/psi maps of 36 x 36 bins, each of the last part, as long in both, of as many replicas as
+half of the smaller set has, mean over random draws. Errors are over replicas, one left out after the other.
 """
 
 from __future__ import annotations
@@ -43,6 +43,8 @@ from systems.units import parse_time_ps, quantity
 SPEC = ForceFieldSpec("ff14SB", "tip3p")
 VOLUME_PS, DISCARDED = 500.0, 0.2
 SETTLED_PS = 200.0
+# A replica is left out that is longer at phi > 0 than this share: it stays for nanoseconds.
+CROSSED = 0.01
 
 
 def at_one_bar(scene: Scene, *, seed: int) -> Scene:
@@ -109,6 +111,13 @@ def apart(one: Sequence[FloatArray], other: Sequence[FloatArray], n: int) -> str
 
 def make_table(sets: dict[str, list[FloatArray]], machine: str, out: Path, *, is_control: bool) -> None:
     """Lay a set of runs beside another, which is the reference."""
+    note = "; ".join(f"{name}: {len(runs)} runs, {sum(map(len, runs)) / 1e3:.1f} ns" for name, runs in sets.items())
+    crossed = {name: [bool((x[:, 0] > 0).mean() > CROSSED) for x in runs] for name, runs in sets.items()}
+    sets = {
+        name: [x for x, left_out in zip(runs, crossed[name], strict=True) if not left_out]
+        for name, runs in sets.items()
+    }
+    note += "".join(f"; {sum(x)} of {name} crossed to phi > 0 and left out" for name, x in crossed.items() if any(x))
     half = min(map(len, sets.values())) // 2
     measures: dict[str, Callable[[Sequence[FloatArray]], float]] = {
         "psi in the alpha basin, %": lambda runs: 100 * float(is_alpha(np.concatenate(runs)[:, 1]).mean()),
@@ -123,7 +132,7 @@ def make_table(sets: dict[str, list[FloatArray]], machine: str, out: Path, *, is
     table = {
         "command": "python docs/studies/water/alanine_dipeptide.py table FOLDER" + " --control OTHER" * is_control,
         "machine": machine,
-        "note": "; ".join(f"{name}: {len(runs)} x {len(runs[0]) / 1e3:.2f} ns" for name, runs in sets.items()),
+        "note": note,
         "columns": ["", *sets],
         "rows": rows,
     }
@@ -136,6 +145,7 @@ def main() -> None:
     parser.add_argument("folder", type=Path)
     parser.add_argument("--time", default="20ns")
     parser.add_argument("--replicas", type=int, default=0, help="0: 3 by OpenMM, a batch by SIMD")
+    parser.add_argument("--batch", type=int, default=0, help="simd: which batch of replicas, with a seed of its own")
     parser.add_argument("--padding", help="distance between images, in a cell of its own at the volume of 1 bar")
     parser.add_argument("--control", type=Path, help="table: runs in another cell, instead of OpenMM's")
     parser.add_argument("-o", "--out", type=Path, default=Path("docs/results/tables/water_alanine_dipeptide.json"))
@@ -161,8 +171,9 @@ def main() -> None:
         scene = Scene.from_dict(json.loads(path.read_text()))
     config = MDConfig(force=SPEC, time_ps=parse_time_ps(args.time), keep="solute", platform=args.what)
     if args.what == "simd":
-        outs = [args.folder / f"simd_r{k}.h5" for k in range(args.replicas or n_replicas())]
-        simulate_batch(scene, config, outs, resume=any(out.exists() for out in outs))
+        n = args.replicas or n_replicas()
+        outs = [args.folder / f"simd_r{k}.h5" for k in range(args.batch * n, (args.batch + 1) * n)]
+        simulate_batch(scene, replace(config, seed=args.batch), outs, resume=any(out.exists() for out in outs))
         return
     for k in range(args.replicas or 3):
         out = args.folder / f"openmm_r{k}.h5"
