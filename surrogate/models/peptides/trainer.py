@@ -158,7 +158,8 @@ class PeptideTraining:
 
     `time_reversal`: windows are read backwards, too, and frames drawn from equilibrium stand for endless times, both
     weighted by a Markov model of each molecule (`models.peptides.subjects`). `positive_phi_kt`: of residue types, the
-    free energy of phi > 0 over phi < 0 in kT, from metadynamics.
+    free energy of phi > 0 over phi < 0 in kT, from metadynamics. `states_alone`: the flow of the weights that training
+    goes on from stays as it is.
     """
 
     budget_s: float | None = None
@@ -170,6 +171,7 @@ class PeptideTraining:
     device: str = "cpu"
     time_reversal: bool = False
     positive_phi_kt: dict[str, float] = field(default_factory=dict)
+    states_alone: bool = False
     validate_every_s: float = 120.0
 
 
@@ -186,9 +188,13 @@ def train_peptides(
     """
     out = Path(out)
     torch.manual_seed(training.seed)
+    if training.states_alone and start is None:
+        raise InputError("`states_alone` goes on from weights, of which it keeps the flow; give them.")
     if start is not None:
         # Trained further, a flow forgets the few steps that it was distilled to.
-        config = replace(start.model.config, usual_steps=config.usual_steps, usual_solver=config.usual_solver)
+        kept = start.model.config if training.states_alone else config
+        config = replace(start.model.config, usual_steps=kept.usual_steps, usual_solver=kept.usual_solver,
+                         coupled=start.model.config.coupled or config.coupled)  # fmt: skip
     config = with_scale(config, sets)
     device = torch.device(training.device)
     model = PeptideSlide(config).to(device)
@@ -200,8 +206,9 @@ def train_peptides(
         _go_on_from(cast(PeptideSlide, start.model), model)
     if training.time_reversal:
         subjects = [subject.in_equilibrium(training.positive_phi_kt) for subject in subjects]
+    of_jumps = 1.0 if training.states_alone else JUMPS_SHARE
     flow_s, jumps_s = (
-        None if training.budget_s is None else share * training.budget_s for share in (1 - JUMPS_SHARE, JUMPS_SHARE)
+        None if training.budget_s is None else share * training.budget_s for share in (1 - of_jumps, of_jumps)
     )
     shared = StageConfig(
         "flow", training.batch, training.learning_rate, flow_s, training.steps, seed=training.seed,
@@ -263,7 +270,8 @@ def train_peptides(
 
     def in_turn() -> Iterator[Stage]:
         for stage, trained, loss_fn in zip(stages, (model.flow, model.jumps), (flow_loss, jumps_loss), strict=True):
-            yield Stage(trained, stage, loss_fn, partial(validate, stage))
+            if stage.name == "jumps" or not training.states_alone:
+                yield Stage(trained, stage, loss_fn, partial(validate, stage))
         balance_entries(model, subjects)
 
     train_stages(in_turn(), out, write, device=device, resume=resume, progress=progress)

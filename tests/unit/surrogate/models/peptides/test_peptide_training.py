@@ -346,3 +346,20 @@ def test_a_flow_is_taught_to_end_in_two_evaluations_where_it_ended_in_six(
     model, once = PeptideTrainer().settings(request).model, replace(training, steps=1)
     on = load_weights(train_peptides([frames], request.out, model, once, start=found)).model
     assert (on.usual_steps, on.solvers[0]) == (6, "gaussian")
+
+
+def test_probabilities_of_states_can_be_trained_alone_and_coupled(frames: TrainingFrames, tmp_path: Path) -> None:
+    first = train_peptides(
+        [frames], tmp_path / "a.safetensors", replace(SMALL, usual_steps=3), PeptideTraining(steps=2)
+    )
+    start, alone = load_weights(first), PeptideTraining(steps=2, states_alone=True)
+    with pytest.raises(InputError, match="goes on from weights"):
+        train_peptides([frames], tmp_path / "b.safetensors", SMALL, alone)
+    coupled = replace(SMALL, coupled=True)
+    found = load_weights(train_peptides([frames], tmp_path / "b.safetensors", coupled, alone, start=start)).model
+    before, after = start.model.state_dict(), found.state_dict()
+    assert all(torch.equal(tensor, after[name]) == (not name.startswith("jumps.of_given")) for name, tensor in
+               before.items() if name.startswith(("flow", "token", "correlation", "jumps.of_given")))  # fmt: skip
+    assert any(name.startswith("jumps.blocks") for name in after) and found.usual_steps == 3
+    on = load_weights(train_peptides([frames], tmp_path / "c.safetensors", SMALL, alone, start=load_weights(first)))
+    assert not any(name.startswith("jumps.blocks") for name in on.model.state_dict())
