@@ -220,8 +220,9 @@ def _of_quantum(scene: Scene | str, asked: Mapping[str, Any]) -> dict[str, Any]:
     longest_ps = _longest_step_ps(scene)
     step_ps = asked.get("timestep_ps", _FLEXIBLE_QUANTUM_STEP_PS if is_flexible else longest_ps)
     if step_ps > longest_ps:
-        stiff = "a bond this stiff (triple, aldehyde, imine, =CH2, CH=CH, C=O in a small ring)"
-        what = stiff if longest_ps < LONGEST_QUANTUM_STEP_PS else QUANTUM
+        from systems.chemistry.graph import STIFF_BOND
+
+        what = STIFF_BOND if longest_ps < LONGEST_QUANTUM_STEP_PS else QUANTUM
         use = format_time_ps(longest_ps).replace(" ", "")
         raise InputError(f"{format_time_ps(step_ps)} is too long for {what}; use `timestep_ps='{use}'` or less.")
     is_long = step_ps > LONGEST_FLEXIBLE_STEP_PS

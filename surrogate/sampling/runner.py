@@ -32,7 +32,7 @@ from surrogate.sampling.chunks import (
 from surrogate.sampling.config import RolloutConfig as RolloutConfig
 from surrogate.sampling.coupling import Coupling, PotentialChecks
 from surrogate.sampling.domain import DomainMatch, fit_weights, in_bath, in_step
-from systems.chemistry.graph import STIFF_STEP_PS
+from systems.chemistry.graph import STIFF_BOND, STIFF_STEP_PS
 from systems.chemistry.validity import INVALID, Geometry, check_frames
 from systems.errors import InputError, SimulationError, first_line
 from systems.files.outside import UNREADABLE, arrays_in, check_disk
@@ -354,8 +354,8 @@ def rollout(
     weights = in_bath(weights, config.bath)
     if config.timestep_ps is not None and in_step(weights, scene) is not weights:
         raise InputError(
-            f"{format_time_ps(config.timestep_ps)} is too long for a bond this stiff (triple, aldehyde, imine, =CH2, "
-            f"CH=CH, C=O in a small ring); use `timestep_ps='{1e3 * STIFF_STEP_PS:g}fs'` or less."
+            f"{format_time_ps(config.timestep_ps)} is too long for {STIFF_BOND}; use "
+            f"`timestep_ps='{1e3 * STIFF_STEP_PS:g}fs'` or less."
         )
     weights, match = fit_weights(
         scene, weights, temperature_k=config.temperature_k, force=config.force, lag_ps=config.lag_ps,

@@ -157,6 +157,7 @@ def _cis_trans(positions_nm: FloatArray, neighbours: list[list[int]], colours: l
 # carbon that bears hydrogen to N or O: aldehydes 0.121, imines 0.128; in aromatic rings 0.132 and more. And the longest
 # step of MD at quantum level with such a bond.
 _TRIPLE_NM, _DOUBLE_NM, STIFF_STEP_PS = 0.1225, 0.130, 0.002
+STIFF_BOND = "a bond this stiff (triple, aldehyde, imine, =CH2, CH=CH, C=O in a small ring)"
 # Of CH=CH: shorter than in rings with five delocalised bonds, and than in benzene.
 _VINYL_NM, _RING_NM = 0.136, 0.1385
 
