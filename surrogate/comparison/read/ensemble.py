@@ -247,10 +247,22 @@ def load_ensemble(
         sources=tuple(str(p) for p in paths),
         top=None if top is None else str(top),
         stated_lag_ps=lag_ps,
-        notes=tuple(notes),
+        notes=_together(notes, paths),
         kept=part,
         grids_nm=tuple(grids),
         **known,
+    )
+
+
+def _together(notes: Sequence[str], paths: Sequence[str | Path]) -> tuple[str, ...]:
+    """Return notes, a line for what is said of several files alike."""
+    files_of: dict[str, list[str]] = {}
+    for note in notes:
+        path = next((f"{p}: " for p in paths if note.startswith(f"{p}: ")), "")
+        files_of.setdefault(note.removeprefix(path), []).append(path)
+    return tuple(
+        (f"{files[0][:-2]} and {len(files) - 1} more: " if files[0] and len(files) > 1 else files[0]) + said
+        for said, files in files_of.items()
     )
 
 

@@ -159,6 +159,15 @@ def test_a_stated_lag_wins_and_the_difference_is_said(save: Save, frames: np.nda
     assert any("2 ps per frame as stated; the file itself says 1 ps" in note for note in ensemble.notes)
 
 
+def test_what_is_said_of_several_files_alike_is_said_once(save: Save, frames: np.ndarray) -> None:
+    paths = [save(f"{name}.h5", frames, steps(60, lag)) for name, lag in (("a", 1.0), ("b", 1.0), ("c", 4.0))]
+    said = [note for note in load_ensemble(paths, lag_ps=2.0).notes if "as stated" in note]
+    assert said == [
+        f"{paths[0]} and 1 more: 2 ps per frame as stated; the file itself says 1 ps.",
+        f"{paths[2]}: 2 ps per frame as stated; the file itself says 4 ps.",
+    ]
+
+
 def test_replicas_of_different_intervals_are_refused(save: Save, frames: np.ndarray) -> None:
     paths = [save("e.h5", frames, steps(60)), save("f.h5", frames, steps(60, 2.0))]
     with pytest.raises(InputError, match="must share one save interval"):
