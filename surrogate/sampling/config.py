@@ -33,6 +33,9 @@ class RolloutConfig:
         None,
         unset="the longest that the save interval is a multiple of",
     )
+    solvent: str | None = option(
+        "Solvent, for weights trained in several: obc2, tip3p.", None, unset="the first that they were trained in"
+    )
     guard: str = option(
         "Action on invalid frames: flag, resample (the chunk), repair (by OpenMM), fallback (MD instead) or off.",
         "flag",

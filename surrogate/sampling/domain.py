@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import math
 from collections.abc import Mapping
 from contextlib import suppress
@@ -320,11 +321,12 @@ def _refused(scene: Scene, found: DomainMatch, domain: TrainingDomain, name: str
 
 def fit_weights(
     scene: Scene, weights: Weights, *, temperature_k: float | None = None, force: bool = False,
-    lag_ps: float | None = None, save_every_ps: float | None = None,
+    lag_ps: float | None = None, save_every_ps: float | None = None, solvent: str | None = None,
 ) -> tuple[Weights, DomainMatch]:  # fmt: skip
-    """Return weights as a rollout of this scene takes them, for one molecule at one lag, and the match to that. Raises
-    OutOfDomainError as `match_domain` does, InputError for a lag that the weights were not trained for."""
-    weights = in_step(weights, scene)
+    """Return weights as a rollout of this scene takes them, for one molecule in one solvent at one lag, and the match
+    to that. Raises OutOfDomainError as `match_domain` and `under_conditions` do, InputError for a lag that the weights
+    were not trained for."""
+    weights = in_step(under_conditions(weights, {"solvent": solvent}), scene)
     match = match_domain(scene, weights, temperature_k=temperature_k, force=force)
     return at_lag(weights, match.domain, choose_lag(weights, lag_ps, save_every_ps)), match
 
@@ -410,6 +412,7 @@ def choose_weights(
     says what the nearest lack, when none covers the scene.
     """
     found, refusals, levels, loaded, at_other_k = [], [], {}, {}, False
+    asked = conditions or {}
     for name, path in shipped_weights().items():
         header = read_header(path)
         arch = architecture(header.arch)
@@ -418,7 +421,7 @@ def choose_weights(
         is_potential = isinstance(arch.model, type) and issubclass(arch.model, Potential)
         asked_k = None if is_potential else temperature_k
         general, level = header.domain.chemistry is not None, header.domain.conditions.get("force_field")
-        if general and (conditions or {}).get("force_field") != level:
+        if general and asked.get("force_field") != level:
             with suppress(OutOfDomainError):
                 match_known(scene, header.domain, path.name, peptides, temperature_k=asked_k)
                 said = f"{name}, where its level is asked for: `level='{level}'`."
@@ -428,8 +431,10 @@ def choose_weights(
         try:
             match = match_known(scene, header.domain, path.name, peptides, temperature_k=asked_k)
             apart = True
-            check_conditions(header.domain.conditions, conditions or {}, path.name)
+            domain = domain_under(header.domain, asked, path.name)
             apart = False
+            if domain is not header.domain:
+                match = match_known(scene, domain, path.name, peptides, temperature_k=asked_k)
             if general:  # by MD: last
                 bath = {} if temperature_k is None else {"temperature_k": temperature_k}
                 loaded[name] = in_bath(load_weights(path), bath)
@@ -438,7 +443,7 @@ def choose_weights(
             if asked_k is not None:
                 with suppress(OutOfDomainError):
                     match_known(scene, header.domain, path.name, peptides)
-                    check_conditions(header.domain.conditions, conditions or {}, path.name)
+                    domain_under(header.domain, asked, path.name)
                     at_other_k = True
             n_reasons = 0 if general else len(error.args[0].split("; "))
             refusals.append((*((False, 0) if apart else (not error.forcible, n_reasons)), name, error))
@@ -456,11 +461,36 @@ def choose_weights(
     why = "cover this molecule although it was not in their training set" if unseen else "were trained on this molecule"
     beside = f"; {', '.join(others)} would also work" if others else ""
     # Those that were asked know the molecule's minimum.
-    return loaded.get(name) or load_weights(path), f"no weights named: using the shipped {name}, which {why}{beside}"
+    weights = loaded.get(name) or under_conditions(load_weights(path), asked)
+    return weights, f"no weights named: using the shipped {name}, which {why}{beside}"
 
 
-def check_conditions(known: Mapping[str, Any], asked: Mapping[str, Any], name: str) -> None:
-    """Raise OutOfDomainError where weights of that name say that they were trained under other conditions."""
-    apart = [f"{key} {known[key]}, not {value}" for key, value in asked.items() if known.get(key) not in (None, value)]
+def under_conditions(weights: Weights, asked: Mapping[str, Any]) -> Weights:
+    """Return weights as those of the solvent that is asked for, the first where there are several and none is named.
+    Raises OutOfDomainError where they were trained under other conditions."""
+    domain, model = domain_under(weights.domain, asked, weights.path.name), weights.model
+    solvent = domain.conditions.get("solvent")
+    if solvent != model.solvent and isinstance(model, PeptideSlide) and model.config.solvents:
+        model = copy.copy(model)
+        model.solvent = solvent
+    return (
+        weights if domain is weights.domain and model is weights.model else replace(weights, model=model, domain=domain)
+    )
+
+
+def domain_under(domain: TrainingDomain, asked: Mapping[str, Any], name: str) -> TrainingDomain:
+    """Return the domain of the molecules that weights of that name saw in one solvent, as `under_conditions` does."""
+    members, solvents = domain.members, list(dict.fromkeys(m.conditions.get("solvent") for m in domain.members))
+    if len(solvents) > 1:
+        solvent = asked.get("solvent") or solvents[0]
+        members = tuple(m for m in members if m.conditions.get("solvent") == solvent)
+        if not members:
+            raise OutOfDomainError(f"{name} was trained in {' and '.join(map(str, solvents))}, not in {solvent}")
+    known = members[0].conditions
+    apart = [f"{key} {known[key]}, not {value}" for key, value in asked.items()
+             if value is not None and known.get(key) not in (None, value)]  # fmt: skip
     if apart:
         raise OutOfDomainError(f"{name} was trained under other conditions: {', '.join(apart)}")
+    if len(solvents) == 1:
+        return domain
+    return replace(members[0], further=members[1:], transferable=domain.transferable, chemistry=domain.chemistry)

@@ -359,7 +359,7 @@ def rollout(
         )
     weights, match = fit_weights(
         scene, weights, temperature_k=config.temperature_k, force=config.force, lag_ps=config.lag_ps,
-        save_every_ps=config.save_every_ps,
+        save_every_ps=config.save_every_ps, solvent=config.solvent,
     )  # fmt: skip
     if announce is not None:
         for line in match.input_notes(weights.path.name):

@@ -115,6 +115,7 @@ class SimulationOptions:
 
     seed: int = from_field(RolloutConfig, "seed")
     lag_ps: float | None = from_field(RolloutConfig, "lag_ps")
+    solvent: str | None = from_field(RolloutConfig, "solvent")
     force: bool = from_field(RolloutConfig, "force")
     solver: str | None = from_field(RolloutConfig, "solver")
     solver_steps: int | None = from_field(RolloutConfig, "solver_steps")
@@ -132,7 +133,8 @@ class Simulation:
 
     `scene` and `weights` are what the command line takes, or a Scene and loaded weights.
     `force` runs a scene that leaves the training domain where that is possible; `deviations` then says how. `lag_ps`:
-    the time of a step, of weights that were trained for several. Raises OutOfDomainError, InputError, WeightsError.
+    the time of a step, of weights that were trained for several; `solvent`: one of theirs. Raises OutOfDomainError,
+    InputError, WeightsError.
     """
 
     @options_as_keywords(SimulationOptions)
@@ -150,7 +152,9 @@ class Simulation:
             scene = prepare(str(scene))
         if isinstance(weights, str | Path):
             weights = load_weights(weights_path(weights))
-        weights, match = fit_weights(scene, weights, force=options.force, lag_ps=options.lag_ps)
+        weights, match = fit_weights(
+            scene, weights, force=options.force, lag_ps=options.lag_ps, solvent=options.solvent
+        )
         self.scene, self.weights, self.deviations = scene, weights, match.deviations
         self.topology = scene.to_openmm_topology()
         self.system = openmm.System()

@@ -158,7 +158,8 @@ def rollout(
     this `level` of theory, and says which and why; 'gfn2-xtb' is of any drug-like molecule. Atoms are written in the
     scene's own order, frames at the interval of the weights or a multiple of it (`save_every_ps`), each marked with its
     chunk and validity. Weights that were trained for several lags step at `lag_ps`, by default at the longest that
-    `save_every_ps` is a multiple of; weights of several peptides take others of the same residues. Replicas run in one
+    `save_every_ps` is a multiple of; weights of several peptides take others of the same residues. Of weights that were
+    trained in several solvents `solvent` names one; only solutes are rolled. Replicas run in one
     batch, are named as by `reference` and joined as there. `solver`: 'multistep', 'fitted' (for few `solver_steps`, 2
     to 10), 'euler' or the adaptive 'dopri5', None for the one that suits the weights. `precision`: 'fp32', 'bf16' or
     'auto'.
@@ -179,17 +180,16 @@ def rollout(
     molecule = prepare_scene(scene, options, quiet=options.quiet)
 
     from surrogate.models.weights import load_weights
-    from surrogate.sampling.domain import check_conditions, choose_lag, choose_weights
+    from surrogate.sampling.domain import choose_lag, choose_weights, under_conditions
     from surrogate.sampling.runner import rollout as roll
 
     config = part_of(options, RolloutConfig)
-    conditions = {"force_field": level} if (level := at_level(options.level, None)) else {}
+    conditions = {"force_field": at_level(options.level, None), "solvent": config.solvent}
     if file is None:
         loaded, why = choose_weights(molecule, temperature_k=config.temperature_k, conditions=conditions)
         tell(molecule.name, why, quiet=options.quiet)
     else:
-        loaded = load_weights(file)
-        check_conditions(loaded.domain.conditions, conditions, loaded.path.name)
+        loaded = under_conditions(load_weights(file), conditions)
     if options.level == "mm" and loaded.domain.conditions.get("force_field") == QUANTUM:
         raise InputError(f"{loaded.path.name} is of {QUANTUM}; leave `level` out, or ask for that.")
     saved_ps = choose_lag(loaded, config.lag_ps, None) if config.save_every_ps is None else config.save_every_ps

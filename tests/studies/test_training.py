@@ -11,6 +11,8 @@ import lag_errors
 import numpy as np
 import peptide_runs
 import peptide_seeds
+import peptide_transfer
+import peptide_unseen
 import pytest
 from peptide_energies import wham
 from peptide_list import (
@@ -25,6 +27,7 @@ from peptide_list import (
     wide_peptides,
 )
 
+from systems.errors import InputError
 from systems.prepare.peptide import build_peptide
 from systems.trajectory.codec import open_trajectory
 
@@ -139,3 +142,42 @@ def test_correlation_and_distance_of_known_processes() -> None:
     angles = rng.uniform(-np.pi, np.pi, (20_000, 2))
     assert lag_errors.joint_distance(angles, angles) == 0.0
     assert lag_errors.joint_distance(angles, 0.1 * angles) > 0.7
+
+
+def processes(memory: float, shift: float, seed: int) -> list[np.ndarray]:
+    """Return eight runs of two angles that move about `shift` and keep `memory` of where they were."""
+    rng = np.random.default_rng(seed)
+    x = rng.normal(size=(8, 4000, 2))
+    for k in range(1, 4000):
+        x[:, k] = memory * x[:, k - 1] + math.sqrt(1 - memory**2) * x[:, k]
+    return list(shift + 0.6 * x)
+
+
+def test_distances_over_those_of_md_itself_tell_what_is_off() -> None:
+    md, like, off = processes(0.9, 0.0, 1), processes(0.9, 0.0, 2), processes(0.9, 0.1, 3)
+    for measure in (peptide_unseen.single, peptide_unseen.pooled):
+        same, shifted = (
+            peptide_unseen.over(measure, peptide_unseen.densities(md), peptide_unseen.densities(x)) for x in (like, off)
+        )
+        assert same == pytest.approx(1.0, abs=0.1) and shifted > 1.3
+    joint, halves = ([peptide_unseen.joint_densities(x, [(0, 1)])[0] for x in some] for some in ([[md[0]]], [[off[0]]]))
+    assert joint[0].shape == halves[0].shape == (1, 36 * 36) and joint[0].sum() == 4000
+
+
+def test_kinetics_and_lags_are_over_those_of_md() -> None:
+    md, slow = processes(0.9, 0.0, 1), processes(0.95, 0.0, 2)
+    found = peptide_unseen.kinetics(md, slow, [1])
+    assert found.keys() == {"ψ 1", "TICA 0", "TICA 1"}
+    assert all(1.6 < x < 2.6 for x in found.values()), "(1 + a) / (1 - a) is 19 and 39"
+    assert all(x == pytest.approx(1.0) for x in peptide_unseen.kinetics(md, md, [1]).values())
+    two = [np.where(x > 0, 2.0, -2.0) + 0.1 * x for x in md]
+    moved = [np.where(x > 0.3, 2.0, -2.0) + 0.1 * x for x in md]
+    errors = peptide_unseen.lag_errors(two, two, {100.0: two, 1000.0: moved})
+    assert errors["100 ps"] == 0.0 and errors["1000 ps"] > 3.0
+
+
+def test_no_training_takes_what_is_tested_by(tmp_path: Path) -> None:
+    (tmp_path / "train" / "GLN-ILE").mkdir(parents=True)
+    with pytest.raises(InputError, match="weights are tested on GLN-ILE"):
+        peptide_transfer.sets_of([tmp_path / "train"], 16)
+    assert peptide_transfer.trained_with({"from": {"from": {"positive_phi_kt": {"ALA": 4.0}}}}) == {"ALA": 4.0}

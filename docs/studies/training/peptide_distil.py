@@ -61,7 +61,9 @@ def distil(
     config = replace(start.model.config, usual_steps=steps, usual_solver=_SOLVER)
     model = PeptideSlide(config).to(device)
     model.load_state_dict(start.model.state_dict())
-    subjects = [PeptideSubject(f, chain_features(f.scene, model.config).to(device)) for f in sets]
+    subjects = [
+        PeptideSubject(f, chain_features(f.scene, model.config, f.conditions.get("solvent")).to(device)) for f in sets
+    ]
     n_held = min(_HELD_WINDOWS, max(_LEAST_HELD, _HELD_IN_ALL // len(subjects)))
     held = [
         (subject, *subject.windows(n_held, model.config, torch.Generator().manual_seed(_HELD_SEED), validation=True))

@@ -40,7 +40,8 @@ def thinned(paths: Sequence[Path], apart_ps: float = FRAMES_PS) -> tuple[Scene, 
 
 
 def rolled(
-    weights: Weights, scene: Scene, outs: Sequence[Path], time_ps: float, lag_ps: float = FRAMES_PS
+    weights: Weights, scene: Scene, outs: Sequence[Path], time_ps: float, lag_ps: float = FRAMES_PS,
+    solvent: str | None = None,
 ) -> list[FloatArray]:  # fmt: skip
     """Return the frames of unguarded rollouts, of molecules longer than any in training too; those that are there are
     read."""
@@ -52,7 +53,7 @@ def rolled(
             scene,
             weights,
             outs,
-            RolloutConfig(time_ps=time_ps, lag_ps=lag_ps, seed=1, guard="off", force=True),
+            RolloutConfig(time_ps=time_ps, lag_ps=lag_ps, solvent=solvent, seed=1, guard="off", force=True),
             overwrite=True,
         )
     return [thinned([out], lag_ps)[1][0] for out in outs]

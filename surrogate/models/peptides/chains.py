@@ -238,9 +238,10 @@ def conditioning_states(states: Tensor, counts: Tensor) -> Tensor:
 
 @dataclass(frozen=True, eq=False)
 class ChainFeatures:
-    """A peptide's features: its `code`, the types of its residues and their neighbours as numbers `places` (n_residues,
-    3), the `template_nm` (n_atoms, 3), which frames are laid on by the atoms `fitted`, the torsions that have states,
-    `stated`, and how near two atoms may come, `least_nm` (n_atoms, n_atoms), 0 where they are bonded or nearly."""
+    """A peptide's features: its `code`, the types of its residues and their neighbours and the solvent as numbers
+    `places` (n_residues, 4), the `template_nm` (n_atoms, 3), which frames are laid on by the atoms `fitted`, the
+    torsions that have states, `stated`, and how near two atoms may come, `least_nm` (n_atoms, n_atoms), 0 where they
+    are bonded or nearly."""
 
     code: ChainCode
     places: Tensor

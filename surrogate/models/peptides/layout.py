@@ -257,8 +257,9 @@ class PeptideConfig(ModelConfig):
     shown. `innovation`: the flow runs on innovations, else on the coordinates themselves. `conditioning_noise`: added
     to the given frame in training, in standard deviations. `turning_weight`: what a torsion's numbers count in the loss
     beside a stiff one. `usual_steps`, `usual_solver`: of rollouts; those that the flow was taught, if it was distilled.
-    `coupled`: neighbours' types and new states count in full when states are drawn (`StateJumps`). Flow times are
-    logit-normal, as elsewhere."""
+    `coupled`: neighbours' types and new states count in full when states are drawn (`StateJumps`). `solvents`: those
+    that training saw, where there are several; the first is meant where none is named. Flow times are logit-normal, as
+    elsewhere."""
 
     width: int = 128
     n_layers: int = 6
@@ -274,6 +275,7 @@ class PeptideConfig(ModelConfig):
     tau_location: float = 0.5
     tau_scale: float = 1.4
     coupled: bool = False
+    solvents: tuple[str, ...] = ()
     types: tuple[str, ...] = ()
     scale: chains.ChainScale | None = None
 
@@ -289,27 +291,42 @@ class PeptideConfig(ModelConfig):
         n = max(2, round(_LAGS_PER_DECADE * decades) + 1)
         return torch.logspace(math.log10(self.shortest_ps), math.log10(self.longest_ps), n, dtype=torch.float64).float()
 
-    def places(self, residues: tuple[str, ...]) -> Tensor:
-        """Return the numbers `(n_residues, 3)` of each residue's type, the one's before and the one's after. Raises
-        InputError for a type that training did not see."""
+    @property
+    def n_types(self) -> int:
+        """Residue types, and the two ends of a chain."""
+        return len(ENDS) + len(self.types)
+
+    def places(self, residues: tuple[str, ...], solvent: str | None = None) -> Tensor:
+        """Return the numbers `(n_residues, 4)` of each residue's type, the one's before and the one's after, and of the
+        solvent. Raises InputError for a type or a solvent that training did not see."""
         numbers = {name: k for k, name in enumerate((*ENDS, *self.types))}
         if unseen := [name for name in residues if name not in numbers]:
             raise InputError(
                 f"residue {unseen[0]} is none that these weights were trained on ({', '.join(self.types)})."
             )
+        if solvent is not None and self.solvents and solvent not in self.solvents:
+            raise InputError(f"these weights were trained in {' and '.join(self.solvents)}, not in {solvent}.")
         row = [numbers[name] for name in (ENDS[0], *residues, ENDS[1])]
-        return torch.tensor([row[1:-1], row[:-2], row[2:]]).T
+        at = self.solvents.index(solvent) if self.solvents and solvent is not None else 0
+        return torch.tensor([row[1:-1], row[:-2], row[2:], [at] * len(residues)]).T
 
 
-def chain_features(scene: Scene, config: PeptideConfig) -> chains.ChainFeatures:
-    """Return a peptide's features. Raises InputError as `chain_layout` and `resolved` do."""
+def kinds_of(places: Tensor, n_types: int) -> Tensor:
+    """`PeptideConfig.places` -> the kinds `(n_residues, 3)` of each residue and its neighbours, a type in a solvent
+    each; without a solvent's column the first is meant."""
+    return places[:, :3] + n_types * places[:, 3:].sum(1, keepdim=True)
+
+
+def chain_features(scene: Scene, config: PeptideConfig, solvent: str | None = None) -> chains.ChainFeatures:
+    """Return a peptide's features, in a solvent that training saw (None: the first). Raises InputError as
+    `chain_layout`, `resolved` and `PeptideConfig.places` do."""
     if config.scale is None:
         raise InputError("these weights do not say how peptides' coordinates are scaled.")
     layout = resolved(chain_layout(scene), config.scale)
     fitted = fitted_atoms(scene)
     template_nm = scene.positions_nm - scene.positions_nm[fitted].mean(axis=0)
     return chains.ChainFeatures(
-        chains.ChainCode(layout, config.scale), config.places(layout.types), template_nm, fitted,
+        chains.ChainCode(layout, config.scale), config.places(layout.types, solvent), template_nm, fitted,
         stated_torsions(scene, layout), _least_distances(scene),
     )  # fmt: skip
 

@@ -22,7 +22,7 @@ from torch.nn import functional as F
 from surrogate.models.lam_slide import flow
 from surrogate.models.layers import ParallelBlock, TimeEmbedding, rotary_angles
 from surrogate.models.peptides.chains import MOST_STATES, MOST_TORSIONS, ChainFeatures, conditioning_states, mended
-from surrogate.models.peptides.layout import ENDS, PeptideConfig, chain_features
+from surrogate.models.peptides.layout import PeptideConfig, chain_features, kinds_of
 from surrogate.models.propagator import Chunk, Molecule, Propagator, row_by_row
 from systems.chemistry.geometry import superpose
 from systems.errors import InputError
@@ -51,11 +51,12 @@ class StateJumps(nn.Module):
 
     `coupled`, for trainings on many more sequences: neighbours' types count in full, attention over residues mixes what
     the given frame tells, and every other residue sees the new states of those beside it, which are drawn first.
+    Each of several solvents has levels of its own, and scales and shifts what the given frame tells.
     """
 
-    def __init__(self, n_slots: int, n_types: int, *, coupled: bool = False) -> None:
+    def __init__(self, n_slots: int, n_types: int, *, coupled: bool = False, n_solvents: int = 1) -> None:
         super().__init__()
-        self.coupled = coupled
+        self.coupled, self.n_types = coupled, n_types
         n_states = MOST_TORSIONS * MOST_STATES
         self.of_numbers = nn.Linear(n_slots, _WIDTH, bias=False)
         self.of_given = nn.ModuleList(nn.Linear(n_states, _WIDTH, bias=False) for _ in range(3))
@@ -69,9 +70,11 @@ class StateJumps(nn.Module):
         self.hidden = nn.Linear(_WIDTH, _WIDTH)
         self.logits = nn.Linear(_WIDTH, MOST_STATES)
         # Of each type and torsion, from one state to another: a level, and a slope with the logarithm of time.
-        self.of_change = nn.Parameter(torch.zeros(2, n_types, MOST_TORSIONS, MOST_STATES, MOST_STATES))
+        n_kinds = n_types * n_solvents
+        self.of_change = nn.Parameter(torch.zeros(2, n_kinds, MOST_TORSIONS, MOST_STATES, MOST_STATES))
         # And a level of the residue before's type, and of the one after's: proline forbids what others allow.
-        self.beside_change = nn.Parameter(torch.zeros(2, n_types, MOST_TORSIONS, MOST_STATES, MOST_STATES))
+        self.beside_change = nn.Parameter(torch.zeros(2, n_kinds, MOST_TORSIONS, MOST_STATES, MOST_STATES))
+        self.of_solvent = solvent_embedding(n_solvents, 2 * _WIDTH)
         nn.init.zeros_(self.logits.weight)
         nn.init.constant_(self.logits.bias, _RARELY)
         if coupled:
@@ -87,7 +90,7 @@ class StateJumps(nn.Module):
 
     def of_observed(self, observed: Tensor, states: Tensor, places: Tensor, counts: Tensor) -> Tensor:
         """What all frames of a chunk have in common: `observed` (b, r, slots), its `states` (b, r, MOST_TORSIONS),
-        `places` (r, 3) -> (b, r, width)."""
+        `places` (r, 4) -> (b, r, width)."""
         beside = _beside(conditioning_states(states, counts))
         h: Tensor = sum((of(x) for of, x in zip(self.of_given, beside, strict=True)), self.of_numbers(observed.float()))
         h = h + self.of_type(places[:, 0])
@@ -97,6 +100,9 @@ class StateJumps(nn.Module):
             still = h.new_zeros(len(h), 3, _WIDTH)
             for block in self.blocks:
                 h = block(h[:, None], still, None, bias=bias)[0][:, 0]
+        if self.of_solvent is not None:
+            scale, shift = self.of_solvent(places[0, 3]).chunk(2)
+            h = h * (1.0 + scale) + shift
         return h
 
     def of_new_states(self, conditioning: Tensor) -> Tensor | float:
@@ -118,9 +124,10 @@ class StateJumps(nn.Module):
         logs = torch.stack([times_ps, apart_ps], dim=-1).float().clamp(min=1e-3).log10()
         angles = logs[..., None] * self.waves
         waves = torch.cat([angles.sin(), angles.cos()], dim=-1).flatten(-2)
-        level, slope = (change[places[:, 0]].transpose(0, 1) for change in self.of_change)
+        kinds = kinds_of(places, self.n_types)
+        level, slope = (change[kinds[:, 0]].transpose(0, 1) for change in self.of_change)
         for which, change in enumerate(self.beside_change):
-            level = level + _FAST * change[places[:, 1 + which]].transpose(0, 1)
+            level = level + _FAST * change[kinds[:, 1 + which]].transpose(0, 1)
         absent = torch.arange(MOST_STATES, device=counts.device) >= counts.T[..., None, None].clamp(min=1)
         levels = (level + slope * logs[..., 1, None, None, None, None]).masked_fill(absent, -torch.inf)
         return self.of_times(torch.cat([waves, logs], dim=-1)), levels
@@ -148,7 +155,8 @@ class StateJumps(nn.Module):
 
     @torch.no_grad()
     def raise_entries(self, of_type: Tensor, before: Tensor, after: Tensor) -> None:
-        """Add levels `(n_types,)` to the logits of entering phi > 0, of the residue's type and of its neighbours'."""
+        """Add levels `(n_types * n_solvents,)` to the logits of entering phi > 0, of the residue's type and of its
+        neighbours'."""
         self.of_change[0, :, 0, 0, 1] += of_type
         self.beside_change[0, :, 0, 0, 1] += before / _FAST
         self.beside_change[1, :, 0, 0, 1] += after / _FAST
@@ -215,6 +223,15 @@ class StateJumps(nn.Module):
             return torch.cat(found, dim=1)
 
 
+def solvent_embedding(n_solvents: int, width: int) -> nn.Embedding | None:
+    """Return what each of several solvents adds, nothing at first."""
+    if n_solvents < 2:
+        return None
+    table = nn.Embedding(n_solvents, width)
+    nn.init.zeros_(table.weight)
+    return table
+
+
 def times_apart(times_ps: Tensor, forgotten_ps: float) -> Tensor:
     """Return the time `(b, t)` between each frame and the one before it; frames of endless times know none before."""
     before = torch.cat([torch.zeros_like(times_ps[:, :1]), times_ps[:, :-1]], dim=1)
@@ -275,8 +292,8 @@ class TypedLinear(nn.Module):
 
 class Conditioning(NamedTuple):
     """What the evaluations of a chunk have in common: `types` (r,), `of_type` (r, width), `given` (b, 1, r, width) the
-    embedded frame, `of_frames` (b, t, r, width) the frames' times and states, `rope` of the frames, and of each layer
-    the `biases` between residues.
+    embedded frame, `of_frames` (b, t, r, width) the frames' times and states, `rope` of the frames, of each layer the
+    `biases` between residues, and what the solvent adds to flow time's embedding, `of_solvent` (width,).
     """
 
     types: Tensor
@@ -285,6 +302,7 @@ class Conditioning(NamedTuple):
     of_frames: Tensor
     rope: tuple[Tensor, Tensor]
     biases: list[Tensor]
+    of_solvent: Tensor | float
 
 
 class PeptideLayer(nn.Module):
@@ -307,7 +325,7 @@ class PeptideFlow(nn.Module):
 
     def __init__(self, config: PeptideConfig, n_slots: int) -> None:
         super().__init__()
-        c, n_types = config, len(config.types) + len(ENDS)
+        c, n_types = config, config.n_types
         self.config = config
         self.of_noisy = TypedLinear(n_slots, c.width, n_types)
         self.of_known = TypedLinear(n_slots, c.width, n_types)
@@ -318,6 +336,7 @@ class PeptideFlow(nn.Module):
         self.waves = nn.Buffer(math.pi * torch.linspace(1.0 / _LONGEST_WAVE, 4.0, n_waves), persistent=False)
         self.of_time = nn.Sequential(nn.Linear(2 * n_waves, c.width), nn.SiLU(), nn.Linear(c.width, c.width))
         self.embed_tau = TimeEmbedding(c.width)
+        self.of_solvent = solvent_embedding(len(c.solvents), c.width)
         self.layers = nn.ModuleList(PeptideLayer(c.width, c.n_heads) for _ in range(c.n_layers))
         self.modulation = nn.Linear(c.width, 6 * c.width)
         self.final_modulation = nn.Linear(c.width, 2 * c.width)
@@ -333,7 +352,7 @@ class PeptideFlow(nn.Module):
 
     def conditioning(self, observed: Tensor, times_ps: Tensor, places: Tensor, states: Tensor) -> Conditioning:
         """Return what all evaluations of a chunk have in common, of the given frame's numbers `observed` (b, r, slots),
-        `times_ps` (b, t), `places` (r, 3), and the `conditioning_states` (b, 1 + t, r, n) of that frame and the
+        `times_ps` (b, t), `places` (r, 4), and the `conditioning_states` (b, 1 + t, r, n) of that frame and the
         others."""
         types = places[:, 0]
         of_states = self.of_states(states, types)
@@ -343,12 +362,13 @@ class PeptideFlow(nn.Module):
         given = self.of_known(observed[:, None], types) + of_states[:, :1] + self.of_given
         of_frames = self._of_times(times_ps)[:, :, None] + of_states[:, 1:]
         biases = [cast(PeptideLayer, layer).of_distance(apart).permute(2, 0, 1) for layer in self.layers]
-        return Conditioning(types, of_type, given, of_frames, (angles.cos(), angles.sin()), biases)
+        of_solvent = 0.0 if self.of_solvent is None else self.of_solvent(places[0, 3])
+        return Conditioning(types, of_type, given, of_frames, (angles.cos(), angles.sin()), biases, of_solvent)
 
     def _network(self, o: Tensor, tau: Tensor, conditioning: Conditioning) -> Tensor:
         noisy = self.of_noisy(o, conditioning.types) + conditioning.of_frames
         h = torch.cat([conditioning.given, noisy], dim=1) + conditioning.of_type
-        time = F.silu(self.embed_tau(tau))
+        time = F.silu(self.embed_tau(tau) + conditioning.of_solvent)
         modulation = self.modulation(time).unflatten(-1, (6, -1))
         h = h.transpose(1, 2)
         for layer, bias in zip(self.layers, conditioning.biases, strict=True):
@@ -367,9 +387,10 @@ class PeptideFlow(nn.Module):
 class PeptideSlide(Propagator):
     """The flow between frames of a peptide, behind the contract of `surrogate.models.propagator`.
 
-    `token_mean` (types, states, slots), `token_scale` (types, slots): what makes a coordinate's numbers centred, for
+    `token_mean` (kinds, states, slots), `token_scale` (kinds, slots): what makes a coordinate's numbers centred, for
     each state of its torsion where that has states (else all are the first), and of unit variance;
-    `correlation` (types, lags, slots): with the same coordinate of an earlier frame, at the configuration's lags.
+    `correlation` (kinds, lags, slots): with the same coordinate of an earlier frame, at the configuration's lags. A
+    kind is a residue type in a solvent.
     """
 
     arch: ClassVar[str] = "lam-slide-peptides"
@@ -385,19 +406,20 @@ class PeptideSlide(Propagator):
             raise InputError(f"usual_solver = {config.usual_solver!r} is none of {', '.join(flow.SOLVERS)}.")
         self.solvers = tuple(dict.fromkeys((config.usual_solver, *flow.SOLVERS)))
         self.usual_steps = config.usual_steps
-        n_types, n_slots = len(config.types) + len(ENDS), config.scale.n_slots
+        n_slots, n_solvents = config.scale.n_slots, max(1, len(config.solvents))
         self.flow = PeptideFlow(config, n_slots)
-        self.jumps = StateJumps(n_slots, n_types, coupled=config.coupled)
+        self.jumps = StateJumps(n_slots, config.n_types, coupled=config.coupled, n_solvents=n_solvents)
         self.lag_range_ps = config.shortest_ps, config.longest_ps
         self.lag_ps = config.shortest_ps
-        self.token_mean = nn.Buffer(torch.zeros(n_types, MOST_STATES, n_slots))
-        self.token_scale = nn.Buffer(torch.ones(n_types, n_slots))
-        self.correlation = nn.Buffer(torch.zeros(n_types, len(config.lags_ps), n_slots))
+        n_kinds = config.n_types * n_solvents
+        self.token_mean = nn.Buffer(torch.zeros(n_kinds, MOST_STATES, n_slots))
+        self.token_scale = nn.Buffer(torch.ones(n_kinds, n_slots))
+        self.correlation = nn.Buffer(torch.zeros(n_kinds, len(config.lags_ps), n_slots))
 
     def featurise(self, scene: Scene) -> Molecule:
         """See `Propagator.featurise`; `own`: the chain's `ChainFeatures`. Raises InputError for a scene that is no
         chain of residues that training saw."""
-        return Molecule.of(scene, chain_features(scene, self.config))
+        return Molecule.of(scene, chain_features(scene, self.config, self.solvent))
 
     @property
     def n_new(self) -> int:
@@ -407,22 +429,26 @@ class PeptideSlide(Propagator):
     def normalised(self, frames_nm: Tensor, chain: ChainFeatures) -> tuple[Tensor, Tensor]:
         """Frames `(..., n_atoms, 3)` nm -> numbers `(..., n_residues, n_slots)`, zero in empty places, and the states
         `(..., n_residues, MOST_TORSIONS)` of torsions."""
-        types, states = chain.places[:, 0], chain.states(frames_nm)
+        states = chain.states(frames_nm)
         centred = chain.code.encode(frames_nm) - self.middle(states, chain)
-        return torch.where(chain.code.filled, centred / self.token_scale[types], 0.0), states
+        return torch.where(chain.code.filled, centred / self.token_scale[self.kinds(chain)], 0.0), states
+
+    def kinds(self, chain: ChainFeatures) -> Tensor:
+        """Return each residue's type in its solvent `(n_residues,)`, as the tables have them."""
+        return kinds_of(chain.places, self.config.n_types)[:, 0]
 
     def middle(self, states: Tensor, chain: ChainFeatures) -> Tensor:
         """Return from where numbers count, `(..., n_residues, n_slots)`, in `states` (..., n_residues,
         MOST_TORSIONS)."""
         own = chain.state_of_numbers(states)
-        mean = self.token_mean[chain.places[:, 0]]
+        mean = self.token_mean[self.kinds(chain)]
         found = mean[:, 0].expand_as(own)
         for state in range(1, MOST_STATES):
             found = torch.where(own == state, mean[:, state], found)
         return found
 
     def _tokens(self, numbers: Tensor, states: Tensor, chain: ChainFeatures) -> Tensor:
-        return numbers.float() * self.token_scale[chain.places[:, 0]] + self.middle(states, chain)
+        return numbers.float() * self.token_scale[self.kinds(chain)] + self.middle(states, chain)
 
     @staticmethod
     def _laid(frames: Tensor, chain: ChainFeatures) -> Tensor:
@@ -430,27 +456,27 @@ class PeptideSlide(Propagator):
         laid = superpose(flat, chain.template_nm, idx=chain.fitted)
         return torch.from_numpy(laid).float().reshape(frames.shape).to(frames.device)
 
-    def correlation_at(self, times_ps: Tensor, types: Tensor) -> Tensor:
+    def correlation_at(self, times_ps: Tensor, kinds: Tensor) -> Tensor:
         """Return the correlations `(b, t, r, slots)` with the given frame, linear in log t between the lags kept; none
         at `forgotten_ps`."""
         if not self.config.innovation:
-            return self.correlation.new_zeros(*times_ps.shape, len(types), self.correlation.shape[-1])
+            return self.correlation.new_zeros(*times_ps.shape, len(kinds), self.correlation.shape[-1])
         lags = self.config.lags_ps.to(times_ps.device).log()
         at = times_ps.float().log().clamp(float(lags[0]), float(lags[-1]))
         right = torch.searchsorted(lags, at).clamp(1, len(lags) - 1)
         share = ((at - lags[right - 1]) / (lags[right] - lags[right - 1]))[..., None, None]
-        table = self.correlation[types].transpose(0, 1)  # (lags, r, slots)
+        table = self.correlation[kinds].transpose(0, 1)  # (lags, r, slots)
         found = (table[right - 1] * (1 - share) + table[right] * share).clamp(0.0, _MOST_CORRELATED)
         return torch.where((times_ps >= self.config.forgotten_ps)[..., None, None], 0.0, found)
 
-    def innovations(self, later: Tensor, observed: Tensor, times_ps: Tensor, types: Tensor) -> Tensor:
+    def innovations(self, later: Tensor, observed: Tensor, times_ps: Tensor, kinds: Tensor) -> Tensor:
         """Numbers `(b, t, r, slots)` at `times_ps` (b, t) after `observed` (b, r, slots) -> innovations."""
-        rho = self.correlation_at(times_ps, types)
+        rho = self.correlation_at(times_ps, kinds)
         return (later - rho * observed[:, None]) / (1.0 - rho.square()).sqrt()
 
-    def from_innovations(self, y: Tensor, observed: Tensor, times_ps: Tensor, types: Tensor) -> Tensor:
+    def from_innovations(self, y: Tensor, observed: Tensor, times_ps: Tensor, kinds: Tensor) -> Tensor:
         """The inverse of `innovations`."""
-        rho = self.correlation_at(times_ps, types)
+        rho = self.correlation_at(times_ps, kinds)
         return rho * observed[:, None] + (1.0 - rho.square()).sqrt() * y
 
     def noise_shape(self, n_atoms: int) -> tuple[int, ...]:
@@ -466,7 +492,7 @@ class PeptideSlide(Propagator):
         if solver in flow.ADAPTIVE and len(noise) > 1:
             draw = partial(self.next_chunk, solver_steps=solver_steps, solver=solver)
             return row_by_row(lambda x, own: draw(x, molecule, own), last_frames_nm, noise)
-        types, filled = chain.places[:, 0], chain.code.filled
+        filled = chain.code.filled
         observed, now = self.normalised(last_frames_nm[:, -1], chain)
         assert self.lag_ps is not None
         ahead = self.lag_ps * torch.arange(1, self.n_new + 1, device=observed.device)
@@ -496,7 +522,8 @@ class PeptideSlide(Propagator):
                 return torch.where(filled, self.flow(o, tau, conditioning), 0.0)
 
             y = flow.SOLVERS[solver](predict, drawn, solver_steps)
-            tokens = self._tokens(self.from_innovations(y, observed[rows], times[rows], types), states[rows], chain)
+            numbers = self.from_innovations(y, observed[rows], times[rows], self.kinds(chain))
+            tokens = self._tokens(numbers, states[rows], chain)
             resolved = mended(tokens.flatten(0, 1), states[rows].flatten(0, 1), chain)
             frames, astray, crowded = (x.unflatten(0, tokens.shape[:2]) for x in resolved)
             return self._laid(frames, chain), astray.any(-1), crowded.any(-1)

@@ -25,6 +25,7 @@ from surrogate.models.peptides.layout import (
     chain_features,
     chain_layout,
     chain_scale,
+    kinds_of,
     standard_peptide,
     unknown_coordinates,
 )
@@ -68,10 +69,10 @@ def balance_entries(model: PeptideSlide, subjects: Sequence[PeptideSubject]) -> 
     phis = [phi for subject in subjects for phi in weighted_phis(model, subject)]
     if not phis:
         return
-    # Of each phi the types of its residue, of the one before and of the one after.
+    # Of each phi the kinds of its residue, of the one before and of the one after.
     types = torch.zeros(len(phis), 3, len(model.token_mean), dtype=torch.float64)
     for of_phi, phi in zip(types, phis, strict=True):
-        of_phi[range(3), phi.chain.places[phi.residue].cpu()] = 1.0
+        of_phi[range(3), kinds_of(phi.chain.places, model.config.n_types)[phi.residue].cpu()] = 1.0
     types = types.flatten(1)
     held = types.T @ types + _RIDGE * torch.eye(types.shape[1], dtype=torch.float64)
     for _ in range(_PASSES):
@@ -148,6 +149,9 @@ _HELD_SEED = 0
 # tenth.
 JUMPS_SHARE = 0.2
 _JUMPS_BATCH = 128
+# What each solvent has of its own, beside means, scales and correlations.
+SOLVENT_PARTS = ("flow.of_solvent.weight", "jumps.of_solvent.weight", "jumps.of_change", "jumps.beside_change")
+TUNED = ("all", "states", "solvent")
 # Torsions' numbers vary by at least this: omega's cosine is all but constant, and nothing is learned of its rounding.
 _LEAST_SCALE = 0.05
 
@@ -158,8 +162,8 @@ class PeptideTraining:
 
     `time_reversal`: windows are read backwards, too, and frames drawn from equilibrium stand for endless times, both
     weighted by a Markov model of each molecule (`models.peptides.subjects`). `positive_phi_kt`: of residue types, the
-    free energy of phi > 0 over phi < 0 in kT, from metadynamics. `states_alone`: the flow of the weights that training
-    goes on from stays as it is.
+    free energy of phi > 0 over phi < 0 in kT, in the first solvent. `tuned`: of weights that training goes on from,
+    'all', the probabilities of 'states' alone, or what is the 'solvent's own (`SOLVENT_PARTS`).
     """
 
     budget_s: float | None = None
@@ -171,7 +175,7 @@ class PeptideTraining:
     device: str = "cpu"
     time_reversal: bool = False
     positive_phi_kt: dict[str, float] = field(default_factory=dict)
-    states_alone: bool = False
+    tuned: str = "all"
     validate_every_s: float = 120.0
 
 
@@ -183,30 +187,40 @@ def train_peptides(
     """Train on frames of several sequences and write `out` (.safetensors); beside it a CSV of the curves: first the
     flow, conditioned on the states of torsions, then the probabilities of these states, which share nothing with it.
 
-    `unseen`: sequences held out whole, whose loss the curves show. `start`: weights to go on from, with their scales.
+    `unseen`: sequences held out whole, whose loss the curves show. `start`: weights to go on from, with their scales;
+    a solvent that these do not know begins as their first. Sequences of several solvents make weights that take one.
     Raises InputError for scenes that are no chains, SimulationError when training diverges.
     """
     out = Path(out)
     torch.manual_seed(training.seed)
-    if training.states_alone and start is None:
-        raise InputError("`states_alone` goes on from weights, of which it keeps the flow; give them.")
+    if training.tuned not in TUNED:
+        raise InputError(f"`tuned` is one of {', '.join(TUNED)}, not {training.tuned!r}.")
+    if training.tuned != "all" and start is None:
+        raise InputError(f"`tuned='{training.tuned}'` goes on from weights, most of which it keeps; give them.")
     if start is not None:
         # Trained further, a flow forgets the few steps that it was distilled to.
-        kept = start.model.config if training.states_alone else config
+        kept = start.model.config if training.tuned == "states" else config
         config = replace(start.model.config, usual_steps=kept.usual_steps, usual_solver=kept.usual_solver,
                          coupled=start.model.config.coupled or config.coupled)  # fmt: skip
-    config = with_scale(config, sets)
+    config = with_scale(in_solvents(config, sets, start), sets)
     device = torch.device(training.device)
     model = PeptideSlide(config).to(device)
     subjects, held_out = (
-        [PeptideSubject(f, chain_features(f.scene, config).to(device)) for f in some] for some in (sets, unseen)
+        [PeptideSubject(f, chain_features(f.scene, config, f.conditions.get("solvent")).to(device)) for f in some]
+        for some in (sets, unseen)
     )
     normalise(model, subjects, training.seed)
     if start is not None:
         _go_on_from(cast(PeptideSlide, start.model), model)
+    _fill_unseen(model, subjects)
     if training.time_reversal:
-        subjects = [subject.in_equilibrium(training.positive_phi_kt) for subject in subjects]
-    of_jumps = 1.0 if training.states_alone else JUMPS_SHARE
+        subjects = [
+            subject.in_equilibrium(training.positive_phi_kt if int(subject.chain.places[0, 3]) == 0 else {})
+            for subject in subjects
+        ]
+    of_jumps = 1.0 if training.tuned == "states" else JUMPS_SHARE
+    for name, p in model.named_parameters():
+        p.requires_grad_(training.tuned != "solvent" or name in SOLVENT_PARTS)
     flow_s, jumps_s = (
         None if training.budget_s is None else share * training.budget_s for share in (1 - of_jumps, of_jumps)
     )
@@ -270,7 +284,7 @@ def train_peptides(
 
     def in_turn() -> Iterator[Stage]:
         for stage, trained, loss_fn in zip(stages, (model.flow, model.jumps), (flow_loss, jumps_loss), strict=True):
-            if stage.name == "jumps" or not training.states_alone:
+            if stage.name == "jumps" or training.tuned != "states":
                 yield Stage(trained, stage, loss_fn, partial(validate, stage))
         balance_entries(model, subjects)
 
@@ -283,6 +297,13 @@ def _strides(config: PeptideConfig, frames: TrainingFrames) -> tuple[int, ...]:
     most = max(high - low for low, high in frames.split.ranges(frames.starts, validation=False)) - 1
     whole = (config.lags_ps / frames.lag_ps).round().long().clamp(1, most)
     return tuple(sorted(set(whole.tolist())))
+
+
+def in_solvents(config: PeptideConfig, sets: Sequence[TrainingFrames], start: Weights | None) -> PeptideConfig:
+    """Return the configuration with the solvents of the weights gone on from and of frames, where there are several."""
+    known = config.solvents or (() if start is None else (str(start.domain.conditions.get("solvent")),))
+    found = tuple(dict.fromkeys((*known, *(str(frames.conditions.get("solvent")) for frames in sets))))
+    return replace(config, solvents=found if len(found) > 1 else ())
 
 
 def with_scale(config: PeptideConfig, sets: Sequence[TrainingFrames]) -> PeptideConfig:
@@ -310,8 +331,11 @@ def _go_on_from(start: PeptideSlide, model: PeptideSlide) -> None:
     whole = model.state_dict()
     with torch.no_grad():
         for name, tensor in start.state_dict().items():
-            # New numbers come after those of `start`.
+            # New numbers come after those of `start`, new solvents after its own.
             whole[name][tuple(slice(n) for n in tensor.shape)] = tensor
+        n, n_types = len(start.token_mean), model.config.n_types
+        for change in (model.jumps.of_change, model.jumps.beside_change):
+            change[:, n:] = change[:, torch.arange(n, change.shape[1], device=change.device) % n_types]
     assert start.config.scale is not None and model.config.scale is not None
     for key in model.config.scale.slots.keys() - start.config.scale.slots.keys():
         places = _places(model.config, key)
@@ -319,42 +343,54 @@ def _go_on_from(start: PeptideSlide, model: PeptideSlide) -> None:
             getattr(model, name)[places] = own[name][places]
 
 
+def _fill_unseen(model: PeptideSlide, subjects: Sequence[PeptideSubject]) -> None:
+    """Give residue types that no peptide shows in a solvent the numbers that they have in the first."""
+    n_types = model.config.n_types
+    seen = {*range(n_types), *(kind for subject in subjects for kind in model.kinds(subject.chain).tolist())}
+    for kind in set(range(len(model.token_mean))) - seen:
+        for table in (model.token_mean, model.token_scale, model.correlation):
+            table[kind] = table[kind % n_types]
+
+
 def _places(config: PeptideConfig, key: str) -> tuple[slice, EllipsisType, slice]:
-    """Return where a coordinate's numbers stand in `(n_types, ..., n_slots)`: of its residue's type, or, where it is a
-    free end's, of all."""
+    """Return where a coordinate's numbers stand in `(n_kinds, ..., n_slots)`: of its residue's type in every solvent,
+    or, where it is a free end's, of all types."""
     assert config.scale is not None
     slot, bearer = config.scale.slots[key], key.split()[0]
-    types = slice(None)
+    kinds = slice(None)
     if bearer not in chains.FREE_ENDS:
-        at = (*ENDS, *config.types).index(bearer)
-        types = slice(at, at + 1)
-    return types, ..., slice(slot, slot + (1 if key in config.scale.mean else 2))
+        kinds = slice((*ENDS, *config.types).index(bearer), None, config.n_types)
+    return kinds, ..., slice(slot, slot + (1 if key in config.scale.mean else 2))
 
 
 @torch.no_grad()
 def normalise(model: PeptideSlide, subjects: Sequence[PeptideSubject], seed: int) -> None:
-    """Measure what centres and scales each residue type's numbers, and their correlations in time, and set them. A
-    torsion's cosine and sine share one scale and one correlation; a free end's numbers are alike in all residues."""
+    """Measure what centres and scales each residue type's numbers in each solvent, and their correlations in time, and
+    set them. A torsion's cosine and sine share one scale and one correlation; a free end's numbers are alike in all
+    residues."""
     assert model.config.scale is not None
     slots = model.config.scale.slots
     of_ends = [_places(model.config, key) for key in slots if key.split()[0] in chains.FREE_ENDS]
     of_turning = [_places(model.config, key) for key in slots if key not in model.config.scale.mean]
     rng = np.random.default_rng(seed)
     lags = model.config.lags_ps
-    n_types, _, n_slots = model.token_mean.shape
-    sums = torch.zeros(3, n_types, chains.MOST_STATES, n_slots, dtype=torch.float64)
+    n_kinds, _, n_slots = model.token_mean.shape
+    by_solvent = (-1, model.config.n_types)
+    sums = torch.zeros(3, n_kinds, chains.MOST_STATES, n_slots, dtype=torch.float64)
     for subject in subjects:
-        _count_middles(sums, subject)
+        kinds = model.kinds(subject.chain).tolist()
+        _count_middles(sums, subject, kinds)
         frames = torch.from_numpy(subject.frames.some_nm(_MEASURED_FRAMES // len(subjects) + _LEAST_MEASURED))
         tokens, states = subject.chain.code.encode(frames).double(), subject.chain.states(frames)
         own = subject.chain.state_of_numbers(states)
-        for r, number in enumerate(subject.chain.places[:, 0].tolist()):
+        for r, number in enumerate(kinds):
             for state in range(chains.MOST_STATES):
                 inside = (own[:, r] == state) & subject.chain.code.filled[r]
                 for power in range(3):
                     sums[power, number, state] += (tokens[:, r].pow(power) * inside).sum(0)
     for _, _, place in of_ends:
-        sums[..., place] = sums[..., place].sum(1, keepdim=True)
+        each = sums[..., place].unflatten(1, by_solvent)
+        sums[..., place] = each.sum(2, keepdim=True).expand_as(each).flatten(1, 2)
     mean = sums[1] / sums[0].clamp(min=1)
     within = (sums[2] - sums[0] * mean.square()).clamp(min=0).sum(1)
     variance = within / sums[0].sum(1).clamp(min=1)
@@ -363,7 +399,7 @@ def normalise(model: PeptideSlide, subjects: Sequence[PeptideSubject], seed: int
     scale = variance.sqrt().clamp(min=_LEAST_SCALE)
     model.token_mean.copy_(mean)
     model.token_scale.copy_(scale)
-    products = torch.zeros(3, n_types, len(lags), n_slots, dtype=torch.float64)
+    products = torch.zeros(3, n_kinds, len(lags), n_slots, dtype=torch.float64)
     for subject in subjects:
         for k, lag in enumerate((lags / subject.frames.lag_ps).round().long().tolist()):
             if lag == 0:
@@ -374,23 +410,24 @@ def normalise(model: PeptideSlide, subjects: Sequence[PeptideSubject], seed: int
                 continue
             first = torch.from_numpy(rng.choice(starts, size=min(_MEASURED_PAIRS // len(subjects) + 100, len(starts))))
             both = subject.seen(model, torch.stack([first, first + lag]))[0].double()
-            for r, number in enumerate(subject.chain.places[:, 0].tolist()):
+            for r, number in enumerate(model.kinds(subject.chain).tolist()):
                 x, y = both[0, :, r], both[1, :, r]
                 for what, value in enumerate((x * y, x * x, y * y)):
                     products[what, number, k] += value.sum(0)
     for _, _, place in of_ends:
-        products[..., place] = products[..., place].sum(1, keepdim=True)
+        each = products[..., place].unflatten(1, by_solvent)
+        products[..., place] = each.sum(2, keepdim=True).expand_as(each).flatten(1, 2)
     for places in of_turning:
         products[:, *places] = products[:, *places].mean(-1, keepdim=True)
     found = products[0] / (products[1] * products[2]).sqrt().clamp(min=1e-12)
     model.correlation.copy_(found.clamp(0.0, 1.0))
 
 
-def _count_middles(sums: Tensor, subject: PeptideSubject) -> None:
+def _count_middles(sums: Tensor, subject: PeptideSubject, kinds: Sequence[int]) -> None:
     """Count one frame in the middle of each state, so that states never seen have a mean."""
     stated, slots = subject.chain.stated, subject.chain.state_at
     for residue, slot, middles in zip(stated.residue.tolist(), stated.slot.tolist(), stated.middles_deg, strict=True):
-        number, at = int(subject.chain.places[residue, 0]), int(torch.nonzero(slots[residue] == slot)[0])
+        number, at = kinds[residue], int(torch.nonzero(slots[residue] == slot)[0])
         for place, value in ((at, middles.deg2rad().cos()), (at + 1, middles.deg2rad().sin())):
             sums[:, number, :, place] += torch.stack([value**power for power in range(3)]).double()
 
@@ -409,7 +446,7 @@ def peptide_loss(
     observed, later = numbers[:, 0], numbers[:, 1:]
     if noisy:
         observed = disturbed(observed, chain, c, generator)
-    target = model.innovations(later, observed, times_ps, chain.places[:, 0])
+    target = model.innovations(later, observed, times_ps, model.kinds(chain))
     draws = torch.randn(len(numbers), generator=generator) * c.tau_scale + c.tau_location
     tau = torch.sigmoid(draws).clamp(max=TAU_MAX).to(numbers.device)
     noise = torch.randn(target.shape, generator=generator).to(numbers.device) * filled

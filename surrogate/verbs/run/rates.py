@@ -219,7 +219,7 @@ def _covering(scene: Scene, config: MDConfig, named: str | Path | None) -> tuple
     """Return the weights that cover the scene under these conditions, and why these or why none."""
     from md_reference.forces.mixture import solute_of
     from surrogate.models.weights import load_weights
-    from surrogate.sampling.domain import check_conditions, choose_weights, match_domain
+    from surrogate.sampling.domain import choose_weights, match_domain, under_conditions
 
     asked = {"force_field": config.force.force_field, "solvent": config.force.solvent}
     if len(solute := solute_of(scene)) < scene.n_atoms and scene.cell_nm is not None:
@@ -232,7 +232,7 @@ def _covering(scene: Scene, config: MDConfig, named: str | Path | None) -> tuple
     weights = load_weights(weights_path(named))
     match_domain(scene, weights, temperature_k=config.temperature_k)
     try:
-        check_conditions(weights.domain.conditions, asked, weights.path.name)
+        weights = under_conditions(weights, asked)
     except OutOfDomainError as error:
         raise OutOfDomainError(f"{error}; leave `weights` out, or ask for these conditions.") from error
     return weights, "asked for"

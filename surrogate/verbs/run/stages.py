@@ -246,6 +246,7 @@ def _roll(site: Site, record: RunRecord) -> RunRecord:
             time_ps=every_ps * max(_LEAST_FRAMES, math.ceil(_AMPLE * rates.stretch * expected_ps / every_ps)),
             save_every_ps=every_ps,
             temperature_k=site.config.temperature_k,
+            solvent=site.config.force.solvent,
             seed=site.options.seed,
             replicas=rates.rolls.replicas,
             anneal_ps=min(_ANNEAL_PS, _ANNEAL * expected_ps) if rates.expensive else 0.0,

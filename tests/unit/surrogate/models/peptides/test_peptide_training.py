@@ -17,13 +17,21 @@ from surrogate.data import Split, TrainingFrames, canonicalise, quantise
 from surrogate.models.architecture import TrainingRequest
 from surrogate.models.peptides import subjects as peptide_subjects
 from surrogate.models.peptides.chains import ChainFeatures
-from surrogate.models.peptides.layout import PeptideConfig, chain_features
+from surrogate.models.peptides.layout import ENDS, PeptideConfig, chain_features
 from surrogate.models.peptides.model import PeptideSlide
 from surrogate.models.peptides.subjects import PeptideSubject
-from surrogate.models.peptides.trainer import PeptideTrainer, PeptideTraining, normalise, train_peptides, with_scale
+from surrogate.models.peptides.trainer import (
+    SOLVENT_PARTS,
+    PeptideTrainer,
+    PeptideTraining,
+    normalise,
+    train_peptides,
+    with_scale,
+)
 from surrogate.models.weights import Weights, load_weights
+from surrogate.sampling.domain import under_conditions
 from surrogate.sampling.runner import RolloutConfig, rollout
-from systems.errors import InputError
+from systems.errors import InputError, OutOfDomainError
 from systems.prepare.peptide import build_peptide
 from systems.trajectory.codec import open_trajectory
 
@@ -42,6 +50,13 @@ def frames() -> TrainingFrames:
         x[:, k] = 0.9 * x[:, k - 1] + 0.436 * rng.normal(size=x[:, 0].shape)
     posed = canonicalise(scene.positions_nm + 0.004 * x.reshape(-1, scene.n_atoms, 3), scene)
     return TrainingFrames(scene, quantise(posed), np.arange(5) * 200, 1.0, True, CONDITIONS, (), split=Split(0.2))
+
+
+def in_water(frames: TrainingFrames) -> TrainingFrames:
+    """Return runs in which atoms tremble twice as far, and forget at once."""
+    x = frames.scene.positions_nm + 0.008 * np.random.default_rng(1).normal(size=(800, frames.scene.n_atoms, 3))
+    coordinates = quantise(canonicalise(x, frames.scene))
+    return replace(frames, coordinates=coordinates, conditions=CONDITIONS | {"solvent": "tip3p"})
 
 
 @pytest.fixture(scope="module")
@@ -352,7 +367,7 @@ def test_probabilities_of_states_can_be_trained_alone_and_coupled(frames: Traini
     first = train_peptides(
         [frames], tmp_path / "a.safetensors", replace(SMALL, usual_steps=3), PeptideTraining(steps=2)
     )
-    start, alone = load_weights(first), PeptideTraining(steps=2, states_alone=True)
+    start, alone = load_weights(first), PeptideTraining(steps=2, tuned="states")
     with pytest.raises(InputError, match="goes on from weights"):
         train_peptides([frames], tmp_path / "b.safetensors", SMALL, alone)
     coupled = replace(SMALL, coupled=True)
@@ -363,3 +378,60 @@ def test_probabilities_of_states_can_be_trained_alone_and_coupled(frames: Traini
     assert any(name.startswith("jumps.blocks") for name in after) and found.usual_steps == 3
     on = load_weights(train_peptides([frames], tmp_path / "c.safetensors", SMALL, alone, start=load_weights(first)))
     assert not any(name.startswith("jumps.blocks") for name in on.model.state_dict())
+
+
+def test_weights_of_two_solvents_know_which_is_meant(frames: TrainingFrames, tmp_path: Path) -> None:
+    """What training saw in the other stays."""
+    wet = in_water(frames)
+    first = load_weights(train_peptides([frames], tmp_path / "a.safetensors", SMALL, PeptideTraining(steps=2)))
+    assert first.model.config.solvents == () and first.model.flow.of_solvent is None
+    found = {
+        tuned: load_weights(
+            train_peptides([wet], tmp_path / f"{tuned}.safetensors", SMALL,
+                           PeptideTraining(steps=20, tuned=tuned), start=first)
+        )
+        for tuned in ("solvent", "all")
+    }  # fmt: skip
+    model, n = found["solvent"].model, len(first.model.token_mean)
+    assert model.config.solvents == ("obc2", "tip3p") and len(model.token_mean) == 2 * n
+    # What was known of the first solvent stays, and only what is the other's own has moved.
+    for name in ("token_mean", "token_scale", "correlation"):
+        assert torch.equal(getattr(model, name)[:n], getattr(first.model, name))
+    before = dict(first.model.named_parameters())
+    moved = {
+        tuned: {
+            name for name, p in one.model.named_parameters()
+            if name in before and not torch.equal(before[name], p[tuple(map(slice, before[name].shape))])
+        }
+        for tuned, one in found.items()
+    }  # fmt: skip
+    assert moved["solvent"] <= set(SOLVENT_PARTS) < moved["all"] | set(SOLVENT_PARTS)
+    assert all(bool(model.get_parameter(name)[-1].any()) for name in SOLVENT_PARTS[:2])
+    # Residue types that are not in the water data have there what they have elsewhere.
+    ala, gone = (n + (*ENDS, *model.config.types).index(name) for name in ("ALA", "NME"))
+    assert float((model.token_scale[ala] / model.token_scale[ala - n]).median()) > 1.5
+    assert torch.equal(model.token_mean[n], model.token_mean[0]) and not torch.equal(
+        model.token_mean[gone], model.token_mean[gone - n]
+    )
+
+
+def test_a_rollout_says_in_which_solvent_of_its_weights(frames: TrainingFrames, tmp_path: Path) -> None:
+    wet = in_water(frames)
+    both = train_peptides([frames, wet], tmp_path / "w.safetensors", SMALL, PeptideTraining(steps=2))
+    deviations = {}
+    for solvent in (None, "obc2", "tip3p"):
+        out = tmp_path / f"{solvent}.h5"
+        config = RolloutConfig(time_ps=400.0, save_every_ps=1.0, guard="off", solvent=solvent)
+        rollout(frames.scene, load_weights(both), [out], config)
+        with open_trajectory(out) as reader:
+            assert reader.record["solvent"] == (solvent or "obc2")
+            apart = np.diff(reader.read(0, 400)[:, [6, 10]], axis=1)  # N and C about CA
+            deviations[solvent] = float(np.linalg.norm(apart, axis=-1).std())
+    assert deviations[None] == deviations["obc2"] < 0.8 * deviations["tip3p"]
+    with pytest.raises(OutOfDomainError, match="was trained in obc2 and tip3p, not in opc"):
+        under_conditions(load_weights(both), {"solvent": "opc"})
+    # Trained on in water alone, weights are of water.
+    on = train_peptides([wet], tmp_path / "on.safetensors", SMALL, PeptideTraining(steps=2), start=load_weights(both))
+    assert under_conditions(load_weights(on), {}).model.solvent == "tip3p"
+    with pytest.raises(OutOfDomainError, match="solvent tip3p, not obc2"):
+        under_conditions(load_weights(on), {"solvent": "obc2"})

@@ -1,0 +1,84 @@
+"""Train weights for peptides on runs in one solvent or several, from nothing or from others.
+
+    python docs/studies/training/peptide_transfer.py OUT.safetensors --train FOLDER [FOLDER ...] --budget 1h
+                            [--start WEIGHTS] [--tuned all|states|solvent] [--coupled] [--runs 16] [--steps N]
+
+FOLDER: `train` in a folder of `peptide_campaign` or `peptide_runs`, of each molecule in it the first `--runs`. `states`
+trains the probabilities of torsion states alone, `solvent` what a solvent has of its own (means, scales, correlations,
+levels and two embeddings); both need `--start`. Free energies of φ > 0 are those of `peptide_energies` beside OUT, or
+those that the weights gone on from were trained with. A training that was stopped goes on.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from peptide_energies import known_energies
+from peptide_list import held_out_peptides, unseen_peptides
+from processes import is_trained
+
+from surrogate.data import TrainingFrames, collect_frames
+from surrogate.models.architecture import weights_path
+from surrogate.models.peptides.layout import PeptideConfig
+from surrogate.models.peptides.trainer import TUNED, PeptideTraining, train_peptides
+from surrogate.models.weights import load_weights
+from systems.errors import InputError
+from systems.units import parse_wall_s
+
+_VALIDATE_S = 300.0
+
+
+def sets_of(folders: Sequence[Path], runs: int) -> list[TrainingFrames]:
+    """Return the frames of every molecule in folders. Raises InputError for one that weights are tested on, or none."""
+    tested = {p.name for p in (*unseen_peptides(), *held_out_peptides()) if len(p.residues) > 1}
+    found = []
+    for place in (place for folder in folders for place in sorted(folder.iterdir()) if place.is_dir()):
+        if place.name in tested:
+            raise InputError(f"{place}: weights are tested on {place.name}; leave it out of training.")
+        if files := sorted(place.glob("run_*.h5"))[:runs]:
+            found.append(collect_frames(files))
+    if not found:
+        raise InputError(f"{', '.join(map(str, folders))} hold no runs.")
+    return found
+
+
+def trained_with(provenance: dict[str, Any] | None) -> dict[str, float]:
+    """Return the free energies of φ > 0 that weights, or those that they began with, were trained with."""
+    while provenance is not None:
+        if found := provenance.get("positive_phi_kt"):
+            return dict(found)
+        provenance = provenance.get("from")
+    return {}
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("out", type=Path)
+    parser.add_argument("--train", type=Path, nargs="+", required=True)
+    parser.add_argument("--start")
+    parser.add_argument("--tuned", choices=TUNED, default="all")
+    parser.add_argument("--coupled", action="store_true")
+    parser.add_argument("--runs", type=int, default=10_000)
+    parser.add_argument("--budget", type=lambda text: parse_wall_s(text, "--budget"))
+    parser.add_argument("--steps", type=int)
+    a = parser.parse_args(arguments)
+    if is_trained(a.out):
+        return
+    sets = sets_of(a.train, a.runs)
+    total_us = sum(frames.total_ps for frames in sets) * 1e-6
+    sys.stdout.write(f"{len(sets)} molecules, {total_us:.3g} µs\n")
+    start = None if a.start is None else load_weights(weights_path(a.start))
+    energies = known_energies(a.out.parent) or trained_with(None if start is None else start.provenance)
+    training = PeptideTraining(
+        budget_s=a.budget, steps=a.steps, time_reversal=True, positive_phi_kt=energies, tuned=a.tuned,
+        validate_every_s=_VALIDATE_S,
+    )  # fmt: skip
+    train_peptides(sets, a.out, PeptideConfig(coupled=a.coupled), training, start=start, resume=True)
+
+
+if __name__ == "__main__":
+    main()

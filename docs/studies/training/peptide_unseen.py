@@ -1,0 +1,193 @@
+"""Weights for peptides on molecules that they never saw, beside MD of these.
+
+    python docs/studies/training/peptide_unseen.py FOLDER --weights W --test CAMPAIGN/test [--solvent tip3p]
+                                                   [--molecules NAME ...] [-o TABLE.json]
+
+Of each molecule the weights roll as many runs as MD has, as long, unguarded, frames 10 ps apart (FOLDER/NAME), and as
+long as the gates of lags need at 100 ps and 1 ns. Torsions: mean Jensen-Shannon distance (root, natural logarithm, 50
+bins) over φ, ψ and χ, of one run to all others' MD (single), and of half of the runs to half of MD's (pooled), over
+that of MD itself; joint maps of ψ and the next φ (36 x 36) pooled. Kinetics: integrated correlation times of every cos
+ψ and along the two slowest TICA coordinates of MD, over MD's. Lags: root mean square difference of the populations of
+torsion states at 100 ps and 1 ns from those at 10 ps, over what MD's halves differ. What is there is read.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from peptide_rollouts import FRAMES_PS, rolled, thinned
+from peptide_scores import angles, turns_of
+
+from surrogate.comparison.measure.distributions import distance
+from surrogate.comparison.measure.kinetics import circular_features, fit_projection, tica_lag, zero_crossing
+from surrogate.comparison.measure.torsions import find_wells
+from surrogate.models.architecture import weights_path
+from surrogate.models.weights import Weights, load_weights
+from surrogate.sampling.domain import fit_weights
+from systems.chemistry.validity import INVALID, Geometry, check_frames
+
+FloatArray = npt.NDArray[np.float64]
+# Runs of torsions in rad, `(n_frames, n_torsions)` each.
+Runs = Sequence[FloatArray]
+LAGS_PS, BINS, JOINT_BINS, HALVES, SEED = (100.0, 1000.0), 50, 36, 10, 0
+
+
+def densities(runs: Runs, bins: int = BINS) -> list[FloatArray]:
+    """Return of each run the histograms of every torsion, `(n_torsions, bins)`."""
+    edges = np.linspace(-math.pi, math.pi, bins + 1)
+    return [np.stack([np.histogram(x, edges)[0] for x in run.T]).astype(np.float64) for run in runs]
+
+
+def joint_densities(runs: Runs, pairs: Sequence[tuple[int, int]]) -> list[FloatArray]:
+    """Return of each run the joint histograms of pairs of torsions, `(n_pairs, JOINT_BINS ** 2)`."""
+    edges = np.linspace(-math.pi, math.pi, JOINT_BINS + 1)
+    return [
+        np.stack([np.histogram2d(run[:, i], run[:, j], (edges, edges))[0].ravel() for i, j in pairs]) for run in runs
+    ]
+
+
+def mean_distance(one: FloatArray, other: FloatArray) -> float:
+    return float(np.mean([distance(a, b) for a, b in zip(one, other, strict=True)]))
+
+
+def single(md: Sequence[FloatArray], of: Sequence[FloatArray]) -> FloatArray:
+    """Return the distance of each run of `of` to all runs of MD but the one of its number."""
+    whole = sum(md)
+    return np.array([mean_distance(whole - md[k], of[k]) for k in range(len(md))])
+
+
+def pooled(md: Sequence[FloatArray], of: Sequence[FloatArray]) -> FloatArray:
+    """Return the distances between random halves of MD's runs and as many of `of`, of the other numbers."""
+    rng, found = np.random.default_rng(SEED), []
+    for _ in range(HALVES):
+        order = rng.permutation(len(md))
+        half = len(md) // 2
+        found.append(mean_distance(sum(md[k] for k in order[:half]), sum(of[k] for k in order[half : 2 * half])))
+    return np.array(found)
+
+
+def over(measure: Callable[..., FloatArray], md: Sequence[FloatArray], of: Sequence[FloatArray]) -> float:
+    """Return a mean distance of `of` to MD over that of MD to itself."""
+    return float(measure(md, of).mean() / measure(md, md).mean())
+
+
+def correlation_times_ps(series: Sequence[FloatArray]) -> FloatArray:
+    """Return the integrated correlation time of each column of runs `(n_frames, k)`."""
+    return FRAMES_PS * np.array([zero_crossing([x[:, k] for x in series])[1] for k in range(series[0].shape[1])])
+
+
+def kinetics(md: Runs, of: Runs, psi: Sequence[int]) -> dict[str, float]:
+    """Return by torsion number of ψ, and for the slowest coordinates, correlation times of `of` over MD's."""
+    columns = {f"ψ {k}": ([np.cos(x[:, [k]]) for x in md], [np.cos(x[:, [k]]) for x in of]) for k in psi}
+    features = [[circular_features(x) for x in some] for some in (md, of)]
+    slow = fit_projection(features[0], tica_lag(FRAMES_PS), 2)
+    if slow is not None:
+        for k in range(slow.matrix.shape[1]):
+            columns[f"TICA {k}"] = tuple([slow.project(x)[:, [k]] for x in some] for some in features)
+    ratios = {name: correlation_times_ps(b) / correlation_times_ps(a) for name, (a, b) in columns.items()}
+    return {name: float(ratio[0]) for name, ratio in ratios.items()}
+
+
+def populations(wells: Sequence[Any], runs: Runs) -> FloatArray:
+    """Return the population of every state of every torsion."""
+    found = []
+    for k, of in enumerate(wells):
+        states = np.concatenate(of.assign([x[:, k] for x in runs]))
+        found += (np.bincount(states, minlength=len(of.names)) / len(states)).tolist()
+    return np.array(found)
+
+
+def lag_errors(md: Runs, at_10: Runs, others: dict[float, Runs]) -> dict[str, float]:
+    """Return for each lag how far populations are from those at 10 ps, over what halves of MD differ."""
+    wells = [find_wells([x[:, k] for x in md]) for k in range(md[0].shape[1])]
+    half = len(md) // 2
+    floor = np.sqrt(np.mean((populations(wells, md[:half]) - populations(wells, md[half:])) ** 2))
+    here = populations(wells, at_10)
+    return {f"{lag:g} ps": float(np.sqrt(np.mean((populations(wells, x) - here) ** 2)) / floor)
+            for lag, x in others.items()}  # fmt: skip
+
+
+def molecule(weights: Weights, runs: Sequence[Path], folder: Path, solvent: str | None) -> dict[str, Any]:
+    """Roll a molecule and return its line of the table."""
+    scene, md_nm, time_ps = thinned(runs)
+
+    def roll(lag_ps: float) -> list[FloatArray]:
+        outs = [folder / f"{lag_ps:g}ps-{k:02d}.h5" for k in range(len(runs))]
+        return rolled(weights, scene, outs, time_ps, lag_ps, solvent)
+
+    own_nm = roll(FRAMES_PS)
+    fitted, _ = fit_weights(scene, weights, lag_ps=FRAMES_PS, force=True, solvent=solvent)
+    geometry = Geometry.from_dict(fitted.domain.geometry)
+    valid = [100.0 * float(np.mean([((check_frames(x, geometry) & INVALID) == 0).mean() for x in some]))
+             for some in (md_nm, own_nm)]  # fmt: skip
+    turns = turns_of(scene)
+    md, of = ([angles(turns, x) for x in some] for some in (md_nm, own_nm))
+    at = {(t.kind, t.residue): k for k, t in enumerate(turns)}
+    pairs = [(k, at["phi", t.residue + 1]) for k, t in enumerate(turns)
+             if t.kind == "psi" and ("phi", t.residue + 1) in at]  # fmt: skip
+    return {
+        "frames": sum(map(len, md)),
+        "torsions, single": over(single, densities(md), densities(of)),
+        "torsions, pooled": over(pooled, densities(md), densities(of)),
+        "joint maps, pooled": over(pooled, joint_densities(md, pairs), joint_densities(of, pairs)) if pairs else None,
+        "MD's own, single": float(single(densities(md), densities(md)).mean()),
+        "kinetics": kinetics(md, of, [k for k, t in enumerate(turns) if t.kind == "psi"]),
+        "lags": lag_errors(md, of, {lag: [angles(turns, x) for x in roll(lag)] for lag in LAGS_PS}),
+        "valid, %: MD, model": valid,
+    }
+
+
+def summary(rows: dict[str, dict[str, Any]]) -> list[str]:
+    """Return the gates, a line each."""
+    lines = []
+    for what in ("torsions, single", "torsions, pooled", "joint maps, pooled"):
+        found = [row[what] for row in rows.values() if row[what] is not None]
+        if found:
+            lines.append(f"{what}: mean {np.mean(found):.2f}, at most {max(found):.2f} of {len(found)}")
+    ratios = np.array([x for row in rows.values() for x in row["kinetics"].values() if math.isfinite(x)])
+    off = np.exp(np.abs(np.log(ratios)))
+    lines.append(f"kinetics: {100 * np.mean(off < 1.4):.0f} % of {len(off)} within 1.4, at most {off.max():.1f} off")
+    for lag in LAGS_PS:
+        found = [row["lags"][f"{lag:g} ps"] for row in rows.values()]
+        lines.append(
+            f"populations at {lag:g} ps: {np.mean(found):.2f} of what MD's halves differ, at most {max(found):.2f}"
+        )
+    lines.append(f"valid: {np.mean([row['valid, %: MD, model'][1] for row in rows.values()]):.2f} %")
+    return lines
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("--weights", required=True)
+    parser.add_argument("--test", type=Path, required=True)
+    parser.add_argument("--solvent")
+    parser.add_argument("--molecules", nargs="+")
+    parser.add_argument("-o", "--out", type=Path)
+    a = parser.parse_args(arguments)
+    weights, rows = load_weights(weights_path(a.weights)), {}
+    for place in sorted(a.test.iterdir()):
+        runs = sorted(place.glob("run_*.h5"))
+        if len(runs) < 4 or (a.molecules and place.name not in a.molecules):
+            continue
+        rows[place.name] = molecule(weights, runs, a.folder / place.name, a.solvent)
+        sys.stdout.write(f"{place.name}: {json.dumps(rows[place.name], ensure_ascii=False)}\n")
+        sys.stdout.flush()
+    if not rows:
+        raise SystemExit(f"{a.test} holds no molecule with four runs or more.")
+    sys.stdout.write("\n".join(summary(rows)) + "\n")
+    if a.out is not None:
+        table = {"weights": weights.hash, "solvent": a.solvent, "summary": summary(rows), "rows": rows}
+        a.out.write_text(json.dumps(table, indent=1, ensure_ascii=False) + "\n", "utf-8")
+
+
+if __name__ == "__main__":
+    main()
