@@ -3,12 +3,13 @@
     python docs/studies/training/peptide_unseen.py FOLDER --weights W --test CAMPAIGN/test [--solvent tip3p]
                                                    [--molecules NAME ...] [-o TABLE.json]
 
-Of each molecule the weights roll as many runs as MD has, as long, unguarded, frames 10 ps apart (FOLDER/NAME), and as
-long as the gates of lags need at 100 ps and 1 ns. Torsions: mean Jensen-Shannon distance (root, natural logarithm, 50
+Of each molecule the weights roll as many runs as MD has, of MD's first 10 ns the same, unguarded, at lags of 10 ps,
+100 ps and 1 ns (FOLDER/NAME). Torsions: mean Jensen-Shannon distance (root, natural logarithm, 50
 bins) over φ, ψ and χ, of one run to all others' MD (single), and of half of the runs to half of MD's (pooled), over
 that of MD itself; joint maps of ψ and the next φ (36 x 36) pooled. Kinetics: integrated correlation times of every cos
-ψ and along the two slowest TICA coordinates of MD, over MD's. Lags: root mean square difference of the populations of
-torsion states at 100 ps and 1 ns from those at 10 ps, over what MD's halves differ. What is there is read.
+ψ and along the two slowest TICA coordinates of MD, over MD's; of MD's halves beside it. Lags: root mean square
+difference of the populations of torsion states at 100 ps and 1 ns from those at 10 ps, over what MD's halves differ.
+What is there is read.
 """
 
 from __future__ import annotations
@@ -37,7 +38,7 @@ from systems.chemistry.validity import INVALID, Geometry, check_frames
 FloatArray = npt.NDArray[np.float64]
 # Runs of torsions in rad, `(n_frames, n_torsions)` each.
 Runs = Sequence[FloatArray]
-LAGS_PS, BINS, JOINT_BINS, HALVES, SEED = (100.0, 1000.0), 50, 36, 10, 0
+RUN_PS, LAGS_PS, BINS, JOINT_BINS, HALVES, SEED = 10_000.0, (100.0, 1000.0), 50, 36, 10, 0
 
 
 def densities(runs: Runs, bins: int = BINS) -> list[FloatArray]:
@@ -118,6 +119,8 @@ def lag_errors(md: Runs, at_10: Runs, others: dict[float, Runs]) -> dict[str, fl
 def molecule(weights: Weights, runs: Sequence[Path], folder: Path, solvent: str | None) -> dict[str, Any]:
     """Roll a molecule and return its line of the table."""
     scene, md_nm, time_ps = thinned(runs)
+    time_ps = min(time_ps, RUN_PS)
+    md_nm = [x[: round(time_ps / FRAMES_PS)] for x in md_nm]
 
     def roll(lag_ps: float) -> list[FloatArray]:
         outs = [folder / f"{lag_ps:g}ps-{k:02d}.h5" for k in range(len(runs))]
@@ -131,6 +134,7 @@ def molecule(weights: Weights, runs: Sequence[Path], folder: Path, solvent: str 
     turns = turns_of(scene)
     md, of = ([angles(turns, x) for x in some] for some in (md_nm, own_nm))
     at = {(t.kind, t.residue): k for k, t in enumerate(turns)}
+    psi = [k for k, t in enumerate(turns) if t.kind == "psi"]
     pairs = [(k, at["phi", t.residue + 1]) for k, t in enumerate(turns)
              if t.kind == "psi" and ("phi", t.residue + 1) in at]  # fmt: skip
     return {
@@ -139,7 +143,8 @@ def molecule(weights: Weights, runs: Sequence[Path], folder: Path, solvent: str 
         "torsions, pooled": over(pooled, densities(md), densities(of)),
         "joint maps, pooled": over(pooled, joint_densities(md, pairs), joint_densities(of, pairs)) if pairs else None,
         "MD's own, single": float(single(densities(md), densities(md)).mean()),
-        "kinetics": kinetics(md, of, [k for k, t in enumerate(turns) if t.kind == "psi"]),
+        "kinetics": kinetics(md, of, psi),
+        "kinetics of MD's halves": kinetics(md[: len(md) // 2], md[len(md) // 2 :], psi),
         "lags": lag_errors(md, of, {lag: [angles(turns, x) for x in roll(lag)] for lag in LAGS_PS}),
         "valid, %: MD, model": valid,
     }
@@ -152,9 +157,10 @@ def summary(rows: dict[str, dict[str, Any]]) -> list[str]:
         found = [row[what] for row in rows.values() if row[what] is not None]
         if found:
             lines.append(f"{what}: mean {np.mean(found):.2f}, at most {max(found):.2f} of {len(found)}")
-    ratios = np.array([x for row in rows.values() for x in row["kinetics"].values() if math.isfinite(x)])
-    off = np.exp(np.abs(np.log(ratios)))
-    lines.append(f"kinetics: {100 * np.mean(off < 1.4):.0f} % of {len(off)} within 1.4, at most {off.max():.1f} off")
+    for what in ("kinetics", "kinetics of MD's halves"):
+        ratios = np.array([x for row in rows.values() for x in row[what].values() if math.isfinite(x)])
+        off = np.exp(np.abs(np.log(ratios)))
+        lines.append(f"{what}: {100 * np.mean(off < 1.4):.0f} % of {len(off)} within 1.4, at most {off.max():.1f} off")
     for lag in LAGS_PS:
         found = [row["lags"][f"{lag:g} ps"] for row in rows.values()]
         lines.append(
