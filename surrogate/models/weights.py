@@ -53,9 +53,10 @@ class TrainingDomain:
     `geometry` and `limits` of its frames, as dictionaries (systems.chemistry.validity.Geometry and Limits).
 
     `lag_ps`: between frames, the shortest where the model takes a lag; `jumps` are then rows (lag, least and greatest
-    jump) that stand for those of `limits` at each lag. `further`: the domains of other molecules trained on.
-    `transferable`: other molecules are covered too (`sampling.domain`): those that `chemistry` says, or peptides of
-    such residues.
+    jump) that stand for those of `limits` at each lag. `further`: the domains of other molecules trained on;
+    `sequences`: residues, as ACE-ALA-NME, of further peptides that were trained on under the same conditions, of which
+    no more is kept. `transferable`: other molecules are covered too (`sampling.domain`): those that `chemistry` says,
+    or peptides of such residues.
     """
 
     scene: Scene
@@ -65,13 +66,22 @@ class TrainingDomain:
     limits: dict[str, Any] | None = None
     jumps: tuple[tuple[float, float, float], ...] = ()
     further: tuple[TrainingDomain, ...] = ()
+    sequences: tuple[str, ...] = ()
     transferable: bool = False
     chemistry: Chemistry | None = None
 
     @property
     def members(self) -> tuple[TrainingDomain, ...]:
-        """The domains of all molecules trained on."""
+        """The domains of molecules trained on, all but those that are known by their residues alone."""
         return (self, *self.further)
+
+    @property
+    def peptides(self) -> tuple[tuple[str, ...], ...]:
+        """The residues of every molecule trained on."""
+        return (
+            *(member.scene.residue_names for member in self.members),
+            *(tuple(sequence.split("-")) for member in self.members for sequence in member.sequences),
+        )
 
     @property
     def longest_lag_ps(self) -> float:
@@ -83,12 +93,13 @@ class TrainingDomain:
         out: dict[str, Any] = {**vars(self), "scene": self.scene.to_dict()}
         out["further"] = [domain.to_dict() for domain in self.further]
         out["chemistry"] = None if self.chemistry is None else asdict(self.chemistry)
-        empty = ("jumps", "further", "transferable", "chemistry")
+        empty = ("jumps", "further", "sequences", "transferable", "chemistry")
         return {key: value for key, value in out.items() if value or key not in empty}
 
     def describe(self) -> str:
         """One line for people: 'alanine-dipeptide (C6H12N2O2, 22 atoms), ff14SB/obc2, 300 K, frames 1 ps apart'."""
         c, names = self.conditions, [domain.scene.name for domain in self.members]
+        names += [sequence for domain in self.members for sequence in domain.sequences]
         lags = f"{self.lag_ps:g}" + (f" to {self.longest_lag_ps:g}" if self.jumps else "")
         what = f"{self.scene.name} ({self.scene.formula}, {self.scene.n_atoms} atoms)"
         if self.further:

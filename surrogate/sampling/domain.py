@@ -55,7 +55,7 @@ def member_of(scene: Scene, domain: TrainingDomain) -> TrainingDomain | None:
             match_atoms(scene, member.scene)
         except OutOfDomainError:
             continue
-        return replace(member, further=(), transferable=False)
+        return replace(member, further=(), sequences=(), transferable=False)
     return None
 
 
@@ -78,10 +78,9 @@ def cover_peptide(
     except InputError as error:
         return domain, np.arange(0), (Deviation("residues", str(error).rstrip("."), forcible=False),)
     found = []
-    free = any(_free_ends(standard))
-    alike = [member.scene for member in domain.members if any(_free_ends(member.scene)) or not free]
-    most = max((_n_amino_acids(scene) for scene in alike), default=0)
-    if (n := _n_amino_acids(standard)) > most:
+    free = any(_free_ends(standard.residue_names))
+    most = max((_n_amino_acids(one) for one in domain.peptides if any(_free_ends(one)) or not free), default=0)
+    if (n := _n_amino_acids(standard.residue_names)) > most:
         what = f"{n} amino acids{' with free ends' if free else ''}; trained on up to {most}"
         found.append(Deviation("size", what, forcible=True))
     first, last = FREE_ENDS
@@ -105,7 +104,7 @@ def cover_peptide(
     }
     own = replace(
         domain, scene=in_standard_pose(standard), conditions=conditions, geometry=geometry.to_dict(), limits=None,
-        further=(), transferable=False,
+        further=(), sequences=(), transferable=False,
     )  # fmt: skip
     return own, order, tuple(found)
 
@@ -113,22 +112,22 @@ def cover_peptide(
 def unseen_neighbours(scene: Scene, domain: TrainingDomain) -> list[str]:
     """Return the pairs of neighbouring residues of a standard peptide that no training peptide has, as 'LEU-SER', or,
     where residues bear free ends, 'NH3+-LEU'."""
-    known = {pair for member in domain.members for pair in _pairs(member.scene)}
-    return [f"{a}-{b}" for a, b in dict.fromkeys(_pairs(scene)) if (a, b) not in known]
+    known = {pair for one in domain.peptides for pair in _pairs(one)}
+    return [f"{a}-{b}" for a, b in dict.fromkeys(_pairs(scene.residue_names)) if (a, b) not in known]
 
 
-def _pairs(scene: Scene) -> list[tuple[str, str]]:
-    first, last = ([end] * free for end, free in zip(FREE_ENDS, _free_ends(scene), strict=True))
-    return list(pairwise([*first, *scene.residue_names, *last]))
+def _pairs(residues: tuple[str, ...]) -> list[tuple[str, str]]:
+    first, last = ([end] * free for end, free in zip(FREE_ENDS, _free_ends(residues), strict=True))
+    return list(pairwise([*first, *residues, *last]))
 
 
-def _free_ends(scene: Scene) -> tuple[bool, bool]:
+def _free_ends(residues: tuple[str, ...]) -> tuple[bool, bool]:
     """Return whether a chain's first residue bears an end of its own, and whether its last does."""
-    return scene.residue_names[0] not in _CAPS, scene.residue_names[-1] not in _CAPS
+    return residues[0] not in _CAPS, residues[-1] not in _CAPS
 
 
-def _n_amino_acids(scene: Scene) -> int:
-    return sum(name not in _CAPS for name in scene.residue_names)
+def _n_amino_acids(residues: tuple[str, ...]) -> int:
+    return sum(name not in _CAPS for name in residues)
 
 
 # Copies of a molecule and chunks of MD on a potential by which its members are asked whether they know it.
@@ -363,10 +362,10 @@ def _compare(
     scene: Scene, domain: TrainingDomain, peptides: PeptideConfig | None, temperature_k: float | None
 ) -> DomainMatch:
     member = member_of(scene, domain)
-    own, order, nearness = member or domain, np.arange(0), ""
+    own, order, nearness, seen = member or domain, np.arange(0), "", member is not None
     if member is None and peptides is not None:
         own, order, beyond = cover_peptide(scene, domain, peptides)
-        found = list(beyond)
+        found, seen = list(beyond), own.scene.residue_names in domain.peptides
         new = ", ".join(unseen_neighbours(own.scene, domain)) if not any(not d.forcible for d in found) else ""
         nearness = f"neighbouring residues not seen in training: {new}" if new else "each pair of residues seen"
     elif member is None and domain.chemistry is not None:
@@ -386,7 +385,7 @@ def _compare(
     if trained_k is not None and abs(asked_k - trained_k) > TEMPERATURE_TOLERANCE_K:
         reason = f"{asked_k:g} K, trained at {trained_k:g} K, and this model takes no temperature"
         found.append(Deviation("temperature", reason, forcible=True))
-    return DomainMatch(order, own, tuple(found), member is not None, nearness)
+    return DomainMatch(order, own, tuple(found), seen, nearness)
 
 
 def _compare_start(scene: Scene, order: npt.NDArray[np.int64], geometry: Geometry) -> list[Deviation]:

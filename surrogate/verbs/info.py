@@ -188,7 +188,10 @@ def _weights(path: Path) -> dict[str, Any]:
         "parameters": n_parameters,
         "scene": weights.domain.scene.name,
         "formula": weights.domain.scene.formula,
-        "molecules": [f"{d.scene.name} ({d.scene.formula})" for d in weights.domain.members],
+        "molecules": [
+            *(f"{d.scene.name} ({d.scene.formula})" for d in weights.domain.members),
+            *(sequence for d in weights.domain.members for sequence in d.sequences),
+        ],
         "covers_unseen_molecules": weights.domain.transferable,
         "lag_ps": weights.domain.lag_ps,
         "longest_lag_ps": weights.domain.longest_lag_ps,

@@ -31,7 +31,15 @@ from surrogate.models.peptides.layout import (
 )
 from surrogate.models.peptides.model import PeptideSlide, times_apart
 from surrogate.models.peptides.subjects import PeptideSubject, StateWindows
-from surrogate.models.weights import Weights, load_weights, provenance_of, read_header, save_weights, training_domain
+from surrogate.models.weights import (
+    TrainingDomain,
+    Weights,
+    load_weights,
+    provenance_of,
+    read_header,
+    save_weights,
+    training_domain,
+)
 from surrogate.training.loop import ProgressFn, Stage, StageConfig, train_stages
 from systems.errors import InputError
 
@@ -149,6 +157,8 @@ _HELD_SEED = 0
 # tenth.
 JUMPS_SHARE = 0.2
 _JUMPS_BATCH = 128
+# Molecules of which the domain of weights keeps all that is checked.
+_WHOLE = 40
 # What each solvent has of its own, beside means, scales and correlations.
 SOLVENT_PARTS = ("flow.of_solvent.weight", "jumps.of_solvent.weight", "jumps.of_change", "jumps.beside_change")
 TUNED = ("all", "states", "solvent")
@@ -271,10 +281,7 @@ def train_peptides(
                 found.setdefault(f"{name}_{key}", []).append(float(value))
         return {key: float(np.mean(values)) for key, values in found.items()}
 
-    domains = [training_domain(f, strides=_strides(config, f)) for f in sets]
-    # One molecule says nothing of others, whatever the weights covered that it was trained from.
-    several = len({f.scene.topology_hash for f in sets}) > 1
-    domain = replace(domains[0], further=tuple(domains[1:]), transferable=several)
+    domain = peptides_domain(sets, config)
 
     def write(spent_s: list[float]) -> None:
         settings: dict[str, Any] = {"seed": training.seed, "spent_s": round(sum(spent_s), 1)}
@@ -290,6 +297,22 @@ def train_peptides(
 
     train_stages(in_turn(), out, write, device=device, resume=resume, progress=progress)
     return out
+
+
+def peptides_domain(sets: Sequence[TrainingFrames], config: PeptideConfig) -> TrainingDomain:
+    """Return the domain of weights for peptides: of each solvent the smallest molecules, whose own frames say what is
+    valid, and the names of all others."""
+    by_solvent: dict[str, dict[str, TrainingFrames]] = {}
+    for frames in sorted(sets, key=lambda frames: (frames.scene.n_atoms, frames.lag_ps)):
+        of_solvent = by_solvent.setdefault(str(frames.conditions.get("solvent")), {})
+        of_solvent.setdefault("-".join(frames.scene.residue_names), frames)
+    found: list[TrainingDomain] = []
+    for some in by_solvent.values():
+        whole = [training_domain(f, strides=_strides(config, f)) for f in list(some.values())[:_WHOLE]]
+        found += [replace(whole[0], sequences=tuple(some)[_WHOLE:]), *whole[1:]]
+    # One molecule says nothing of others, whatever the weights covered that it was trained from.
+    several = len({f.scene.topology_hash for f in sets}) > 1
+    return replace(found[0], further=tuple(found[1:]), transferable=several)
 
 
 def _strides(config: PeptideConfig, frames: TrainingFrames) -> tuple[int, ...]:

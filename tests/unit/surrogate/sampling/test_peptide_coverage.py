@@ -12,15 +12,17 @@ import torch
 from surrogate import api
 from surrogate.data import Split, TrainingFrames, canonicalise, quantise
 from surrogate.models.architecture import weights_path
+from surrogate.models.peptides import trainer
 from surrogate.models.peptides.layout import PeptideConfig, chain_features, standard_peptide
 from surrogate.models.peptides.model import PeptideSlide
 from surrogate.models.peptides.subjects import PeptideSubject
 from surrogate.models.peptides.trainer import normalise, with_scale
-from surrogate.models.weights import Weights, load_weights, read_header, save_weights, training_domain
+from surrogate.models.weights import TrainingDomain, Weights, load_weights, read_header, save_weights, training_domain
 from surrogate.sampling.domain import find_deviations, match_domain
 from surrogate.sampling.runner import RolloutConfig, rollout
 from systems.chemistry.graph import backbone_torsions, bonded_graph, turned
 from systems.errors import InputError, OutOfDomainError, PreparationError
+from systems.files.schema import built
 from systems.prepare.peptide import build_peptide
 from systems.scene import Scene, reordered
 from systems.trajectory.codec import open_trajectory
@@ -146,3 +148,18 @@ def test_without_its_model_a_domain_of_peptides_covers_those_trained_on_alone() 
     assert find_deviations(build_peptide("ACE-ALA-NME"), header.domain) == ()
     unseen = find_deviations(build_peptide("ACE-LEU-SER-NME"), header.domain)
     assert [(d.what, d.forcible) for d in unseen] == [("molecule", False)]
+
+
+def test_of_many_peptides_the_larger_are_known_by_their_residues(
+    weights: Weights, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(trainer, "_WHOLE", 2)
+    domain = trainer.peptides_domain([trembling(name) for name in reversed(TRAINED)], weights.model.config)
+    assert [d.scene.name for d in domain.members] == list(TRAINED[:2]) and domain.sequences == TRAINED[2:]
+    assert built(TrainingDomain, domain.to_dict()).sequences == domain.sequences and "3 molecules" in domain.describe()
+    pair = build_peptide(TRAINED[2])
+    for known, seen in ((domain, True), (replace(domain, sequences=()), False)):
+        match = match_domain(pair, replace(weights, domain=known), force=True)
+        assert match.seen == seen and bool(match.input_notes("w")) != seen
+        assert match.domain.sequences == () and match.domain.scene.residue_names == pair.residue_names
+    assert [d.what for d in find_deviations(pair, replace(domain, sequences=()), model=weights.model)] == ["size"]
