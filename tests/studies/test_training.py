@@ -55,6 +55,8 @@ def test_no_molecule_that_tests_is_in_the_wide_campaign() -> None:
     assert len({p.name for p in wide}) == len(wide) == 22 + 300 + 200 and len({p.name for p in unseen}) == len(unseen)
     assert not {p.residues for p in wide} & {p.residues for p in unseen if len(p.residues) > 1}
     assert sum(not p.capped for p in wide) == 68 and wide_peptides() == wide
+    tenth = wide[22 : 22 + 50]
+    assert sum(len(p.residues) == 2 for p in tenth) == 30 and 4 < sum(not p.capped for p in tenth) < 10
     assert sum(not p.capped and len(p.residues) == 4 for p in unseen) == 12
     missing = {r for p in unseen for r in p.residues} - {r for p in wide for r in p.residues}
     assert not missing

@@ -104,14 +104,18 @@ def unseen_tetrapeptides() -> list[tuple[str, ...]]:
 
 def wide_peptides() -> tuple[Peptide, ...]:
     """Return the molecules of the wide campaign, by which states of torsions may be coupled along the chain: monomers,
-    pairs, chains of three to five residues, a third of these with free ends; sixteen runs of 3 ns each."""
+    then by turns pairs and chains of three to five residues, a third of these with free ends, so that any beginning is
+    a fair part; sixteen runs of 3 ns each."""
     rng = random.Random(_WIDE_SEED)
     tested = {*TEST_PAIRS, *UNSEEN_PAIRS, *TEST_CHAINS, *UNSEEN_CHAINS, *TEST_FREE_CHAINS, *UNSEEN_FREE}
     tested |= {*unseen_tetrapeptides()}
     pairs = rng.sample([pair for pair in product(RESIDUES, repeat=2) if pair not in tested], _WIDE_PAIRS)
     chains = _chains(rng, tested, lengths=(3, 4, 5), n=_WIDE_CHAINS)
     capped = [Peptide(p, True, _TEST_STARTS, 3000.0) for p in (*((r,) for r in RESIDUES), *pairs)]
-    return (*capped, *(Peptide(p, k // 3 % 3 != 0, _TEST_STARTS, 3000.0) for k, p in enumerate(chains)))
+    monomers, capped = capped[: len(RESIDUES)], capped[len(RESIDUES) :]
+    longer = [Peptide(p, k // 3 % 3 != 0, _TEST_STARTS, 3000.0) for k, p in enumerate(chains)]
+    by_turns = sorted(((k + 0.5) / len(some), p.name, p) for some in (capped, longer) for k, p in enumerate(some))
+    return (*monomers, *(p for *_, p in by_turns))
 
 
 def unseen_peptides() -> tuple[Peptide, ...]:
