@@ -541,6 +541,19 @@ class References:
         return sets
 
 
+def rollouts_among(paths: Sequence[Path]) -> list[str]:
+    """Return a line where trajectories are rollouts and no MD, as their records say, else none."""
+    weights = []
+    for path in paths:
+        if not is_windows(path):
+            with open_trajectory(path) as reader:
+                weights += [str(reader.record.get("weights"))] if reader.record.get("kind") == "rollout" else []
+    if not weights:
+        return []
+    of = " and ".join(dict.fromkeys(weights))
+    return [f"{len(weights)} of {len(paths)} files are rollouts of {of}, no MD; what is trained on them has its errors"]
+
+
 def _by_topology(paths: Sequence[Path]) -> dict[str, list[Path]]:
     found: dict[str, list[Path]] = {}
     for path in paths:

@@ -57,7 +57,7 @@ def windows(references: Trajectories, out: PathLike, options: WindowsOptions) ->
     is. `velocities` keeps these as well, for PAINET, and leaves frames in their own pose. Raises InputError when
     scenes, save intervals or conditions differ, TrajectoryError for damaged files.
     """
-    from surrogate.data import collect_frames
+    from surrogate.data import collect_frames, rollouts_among
 
     out = Path(out)
     check_outputs([out], [".h5"], overwrite=options.overwrite)
@@ -66,6 +66,8 @@ def windows(references: Trajectories, out: PathLike, options: WindowsOptions) ->
     canonical = options.canonical and not options.velocities
     frames = collect_frames(paths, canonical=canonical, velocities=options.velocities, held=held, spool=out.parent)
     frames.refuse_leaks()
+    for line in rollouts_among(paths):
+        tell(out.name, line, quiet=options.quiet)
     frames.save(out)
     return out
 
@@ -183,7 +185,7 @@ def _plan(
 ) -> tuple[Trainer, References, TrainingRequest, list[str]]:
     """Find the references and choose what is not asked for; return what trains, on what, how, and the reasons: a line
     for the architecture and one for each setting that was chosen."""
-    from surrogate.data import References
+    from surrogate.data import References, rollouts_among
 
     paths = find_trajectories(references, verify=True)
     held = [] if validation is None else find_trajectories(validation, verify=True)
@@ -199,7 +201,7 @@ def _plan(
     if not explained:
         trainer.check(asked)
     choices = trainer.choose(found, asked)
-    lines = [f"arch = {asked.arch}: {why}", *(choice.line() for choice in choices)]
+    lines = [f"arch = {asked.arch}: {why}", *(choice.line() for choice in choices), *rollouts_among(paths)]
     return trainer, found, asked.with_choices(choices), lines
 
 

@@ -329,3 +329,15 @@ def test_a_training_that_is_done_is_left_alone_and_says_so(tmp_path: Path, capsy
     out.write_bytes(b"weights")
     api.train("smiles:O", out, level="gfn2-xtb", budget_s="1h", resume=True)
     assert "w.safetensors: this training is done" in capsys.readouterr().err and out.read_bytes() == b"weights"
+
+
+def test_rollouts_among_the_references_are_named(
+    alanine: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    rolled = write(tmp_path, build_peptide("ACE-ALA-NME"), record=MD | {"kind": "rollout", "weights": "w.safetensors"})
+    line = "1 of 2 files are rollouts of w.safetensors, no MD; what is trained on them has its errors"
+    assert line in explained([alanine, rolled])[1]
+    sm.windows([alanine, rolled], tmp_path / "both.windows.h5")
+    assert line in capsys.readouterr().err
+    sm.windows([alanine], tmp_path / "one.windows.h5")
+    assert "rollouts" not in capsys.readouterr().err and not any("rollouts" in x for x in explained([alanine])[1])
