@@ -97,6 +97,8 @@ class Propagator(nn.Module, ABC):
     # Shortest and longest spacing of frames of a model trained for several, and that of the frames that it returns.
     lag_range_ps: tuple[float, float] | None = None
     lag_ps: float | None = None
+    # The longest spacing at which populations are those of shorter ones; None where all are as good.
+    usual_lag_ps: float | None = None
     # Which of several solvents its frames are in; None where it knows one, or means its first.
     solvent: str | None = None
     # Prefixes of the names of layers that stay in float32 when the others are evaluated in bf16; None where all do.

@@ -395,6 +395,7 @@ class PeptideSlide(Propagator):
 
     arch: ClassVar[str] = "lam-slide-peptides"
     float32_layers: tuple[str, ...] = ("flow.of_time", "jumps")
+    usual_lag_ps: float | None = 100.0
     config: PeptideConfig
 
     def __init__(self, config: PeptideConfig) -> None:

@@ -78,12 +78,14 @@ def test_weights_say_the_range_and_the_jumps_at_each_lag(weights: Weights, harmo
     assert measured.limits is not None and measured.jumps[0][1] == pytest.approx(measured.limits["jump_min_nm"])
 
 
-def test_the_lag_follows_from_what_is_kept(weights: Weights) -> None:
+def test_the_lag_follows_from_what_is_kept(weights: Weights, monkeypatch: pytest.MonkeyPatch) -> None:
     assert choose_lag(weights, None, None) == 1.0
     assert choose_lag(weights, None, 7.0) == 7.0
     assert choose_lag(weights, None, 60.0) == 20.0
     assert choose_lag(weights, None, 50.0) == pytest.approx(50.0 / 3)
     assert choose_lag(weights, 2.5, 50.0) == 2.5
+    monkeypatch.setattr(weights.model, "usual_lag_ps", 10.0)
+    assert choose_lag(weights, None, 60.0) == 10.0 and choose_lag(weights, 20.0, 60.0) == 20.0
 
 
 @pytest.mark.parametrize(("lag_ps", "save_every_ps"), [(0.5, None), (21.0, None), (None, 0.5)])
