@@ -12,7 +12,7 @@ import numpy as np
 
 from systems.chemistry.graph import backbone_torsions, bonded_graph
 from systems.errors import PreparationError
-from systems.scene import IntArray, Scene, reordered
+from systems.scene import IntArray, Scene, part_of, reordered
 
 # What OpenMM calls the terms of a bonded force, and which of a term's values are particles.
 _TERMS = {
@@ -41,6 +41,14 @@ def solute_of(scene: Scene) -> IntArray:
     """Return the atoms of all molecules but water and single ions, ascending."""
     parts = [m for m in molecules_of(scene) if len(m) > 1 and not is_water(scene.elements, m)]
     return np.sort(np.concatenate(parts)) if parts else np.empty(0, np.int64)
+
+
+def dry_part(scene: Scene) -> Scene:
+    """Return a scene in a periodic cell without the cell and its water and single ions, any other as it is."""
+    if scene.cell_nm is None:
+        return scene
+    solute = solute_of(scene)
+    return replace(scene if len(solute) == scene.n_atoms else part_of(scene, solute), cell_nm=None)
 
 
 # ---- residues -------------------------------------------------------------------------------------------------------

@@ -8,14 +8,14 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
-from itertools import count
+from itertools import count, islice
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from md_reference.forces.forcefield import build_system
-from md_reference.forces.mixture import solute_of
+from md_reference.forces.mixture import dry_part, solute_of
 from md_reference.forces.spec import QUANTUM, ForceFieldSpec
 from md_reference.run.config import Conditions
 from md_reference.run.engine import Engine, Relaxer
@@ -27,7 +27,7 @@ from systems.chemistry.validity import CHIRALITY, NOT_FINITE, OMEGA, RING, check
 from systems.errors import PreparationError, SimulationError
 from systems.interrupts import stop_if_asked
 from systems.prepare.ring_conformers import conformer_of, ring_conformers
-from systems.scene import FloatArray, IntArray, Scene, part_of
+from systems.scene import FloatArray, IntArray, Scene
 
 HOT_K, HOT_PS, FRICTION_PER_PS = 500.0, 100.0, 5.0
 # Of the time it was hot.
@@ -56,22 +56,17 @@ def many_starts(scene: Scene, conditions: Conditions, n: int, *, hot_ps: float =
 
     if n == 1 or scene.interactions is not None:
         return one("one replica" if n == 1 else "a model system")
-    solute = solute_of(scene) if scene.cell_nm is not None else np.arange(scene.n_atoms)
-    if not len(solute):
+    if scene.cell_nm is not None and not len(solute_of(scene)):
         return one("nothing but water and ions")
-    dry = scene if len(solute) == scene.n_atoms and scene.cell_nm is None else part_of(scene, solute)
+    dry = dry_part(scene)
     conformers = ring_conformers(dry)
     if len(conformers) == 1 and not len(rotatable_torsions(dry)):
         return one("it has no rotatable torsions")
-    if scene.cell_nm is not None:
-        dry = replace(dry, cell_nm=None)
     try:
         spec = _hot_forces(conditions.force)
         frames, by = _hot(dry, conformers, replace(conditions, force=spec, ensemble="nvt"), n, hot_ps)
         if scene.cell_nm is not None:
-            angles = np.asarray(torsion(frames, rotatable_torsions(dry)), dtype=np.float64)
-            turned_ps = _TURNED_PS * min(1.0, max(_LEAST_TURNED, hot_ps / HOT_PS))
-            frames = _in_water(scene, conditions, dry, angles, turned_ps)
+            frames = _in_water(scene, conditions, dry, frames, _turned_ps(hot_ps))
     except (PreparationError, SimulationError) as error:
         return one(str(error).rstrip("."))
     how = f"{n} starting structures: the input, and others from {hot_ps:.3g} ps at {HOT_K:g} K ({by})"
@@ -81,11 +76,19 @@ def many_starts(scene: Scene, conditions: Conditions, n: int, *, hot_ps: float =
 
 
 def frames_as_starts(
-    scene: Scene, conditions: Conditions, frames_nm: Iterable[npt.NDArray[np.floating]], n: int
-) -> Starts:
+    scene: Scene, conditions: Conditions, frames_nm: Iterable[npt.NDArray[np.floating]], n: int, *,
+    hot_ps: float = HOT_PS,
+) -> Starts:  # fmt: skip
     """Return starts from frames, each `(n_atoms, 3)` nm: the first `n` that are the scene's molecule when they are
     relaxed near where they are; fewer where fewer are, each then taken several times. Raises SimulationError where none
-    is."""
+    is. In explicit water frames are of the solute, which is turned to their torsions as by `many_starts`."""
+    if scene.cell_nm is not None:
+        dry, first = dry_part(scene), np.stack(list(islice(frames_nm, n))).astype(np.float64)
+        if first.shape[1] != dry.n_atoms:
+            raise SimulationError(f"frames of {first.shape[1]} atoms are not of its solute, which has {dry.n_atoms}")
+        found_nm = _in_water(scene, conditions, dry, first, _turned_ps(hot_ps))
+        scenes = _scenes(scene, found_nm[np.arange(n) % len(found_nm)])
+        return scenes, f"{len(first)} starting structures: frames of the rollout, their torsions set in water"
     found: list[FloatArray] = []
     tried = 0
     geometry = geometry_from_scene(scene)
@@ -185,8 +188,13 @@ def _by_openmm(
             yield engine.positions()[None]
 
 
-def _in_water(wet: Scene, conditions: Conditions, dry: Scene, angles: FloatArray, turned_ps: float) -> FloatArray:
-    """Return positions `(n, n_atoms, 3)` in water whose solute was turned to these torsions `(n, k)` in that time."""
+def _turned_ps(hot_ps: float) -> float:
+    return _TURNED_PS * min(1.0, max(_LEAST_TURNED, hot_ps / HOT_PS))
+
+
+def _in_water(wet: Scene, conditions: Conditions, dry: Scene, frames: FloatArray, turned_ps: float) -> FloatArray:
+    """Return positions `(n, n_atoms, 3)` in water whose solute was turned to the torsions of dry `frames`."""
+    angles = np.asarray(torsion(frames, rotatable_torsions(dry)), dtype=np.float64)
     solute = solute_of(wet)
     quads: IntArray = np.asarray(solute)[rotatable_torsions(dry)]
     system = build_system(wet, conditions.force)

@@ -47,7 +47,10 @@ class Coupling:
         if missing:
             raise InputError(f"{cannot}: they do not say their {' and '.join(missing)}.")
         try:
-            self._spec = resolve(self._scene, ForceFieldSpec.of(self._conditions))
+            spec = ForceFieldSpec.of(self._conditions)
+            if spec.is_explicit and self._scene.cell_nm is None:
+                raise InputError(f"they learned from MD in {spec.solvent}, and a rollout has no water.")
+            self._spec = resolve(self._scene, spec)
             self._system = build_system(self._scene, self._spec)
             self._relaxer = Relaxer(self._scene, self._system, born=self._spec.is_born)
         except SurromdError as error:

@@ -15,7 +15,7 @@ from md_reference.forces.spec import QUANTUM, QUANTUM_SOLVENTS
 from md_reference.run.config import SIMD, MDConfig
 from surrogate.models.architecture import shipped_weights, weights_path
 from systems.errors import OutOfDomainError, SimulationError
-from systems.scene import Scene, part_of
+from systems.scene import Scene
 from systems.units import format_time_ps
 
 if TYPE_CHECKING:
@@ -101,6 +101,7 @@ def measure(scene: Scene, config: MDConfig, named: str | Path | None, cores: int
 
     Raises OutOfDomainError where weights are named and do not cover the scene, and what MD of it raises.
     """
+    from md_reference.forces.mixture import dry_part
     from md_reference.run.machine import available_cores
     from md_reference.run.plan import make_plan
 
@@ -109,13 +110,14 @@ def measure(scene: Scene, config: MDConfig, named: str | Path | None, cores: int
     by_openmm = replace(config, platform="auto") if config.platform == SIMD else config
     plan = make_plan(scene, by_openmm, replicas=cores)
     assert plan.us_per_step is not None
-    weights, coverage = _covering(scene, config, named)
+    dry = dry_part(scene)  # no weights roll water
+    weights, coverage = _covering(dry, config, named)
     rates = Rates(
         n_atoms=_n_written(scene, by_openmm), cores=cores, stretch=stretch,
         expensive=config.force.force_field == QUANTUM, in_water=config.force.solvent in QUANTUM_SOLVENTS,
         md=plan.line, step_s=plan.us_per_step * 1e-6,
         timestep_ps=config.timestep_ps, md_ps_per_s=0.0, coverage=coverage, platform=by_openmm.platform,
-        rolls=None if weights is None else rollout_rate(scene, weights, config.temperature_k, stretch, cores),
+        rolls=None if weights is None else rollout_rate(dry, weights, config.temperature_k, stretch, cores),
     )  # fmt: skip
     rates = replace(rates, md_ps_per_s=rates.openmm_ps_per_s)
     return rates if rates.expensive or config.platform not in ("auto", SIMD) else _by_simd(rates, scene, config)
@@ -217,13 +219,10 @@ def _slowest_ps(files: list[Path]) -> float:
 
 def _covering(scene: Scene, config: MDConfig, named: str | Path | None) -> tuple[Weights | None, str]:
     """Return the weights that cover the scene under these conditions, and why these or why none."""
-    from md_reference.forces.mixture import solute_of
     from surrogate.models.weights import load_weights
     from surrogate.sampling.domain import choose_weights, match_domain, under_conditions
 
     asked = {"force_field": config.force.force_field, "solvent": config.force.solvent}
-    if len(solute := solute_of(scene)) < scene.n_atoms and scene.cell_nm is not None:
-        scene = part_of(scene, solute)  # no weights know water
     if named is None:
         try:
             return choose_weights(scene, temperature_k=config.temperature_k, conditions=asked)

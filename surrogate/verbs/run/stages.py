@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from md_reference.forces.mixture import dry_part
 from md_reference.run.config import MDConfig
 from surrogate.comparison.md_answer import Answer, frames_over_states, md_answer
 from surrogate.comparison.read.ensemble import STOPPED, Ensemble, load_ensemble
@@ -159,10 +160,9 @@ def _starts(site: Site, record: RunRecord, config: MDConfig, files: list[Path]) 
     if config.starts == "one" or len(files) < 2:
         return site.scene, config
     rolled = None
+    hot_ps = min(HOT_PS, 1.2 * config.equilibrate_ps / rates.cores)  # on one core, while the others wait
     if decision.way != "md" and record.trajectory:
         rolled = load_ensemble([site.folder / file for file in record.trajectory])
-        if rolled.scene.n_atoms != site.scene.n_atoms:  # water was not rolled
-            rolled = None
     if rolled is not None:
         left_out_ps = max(config.equilibrate_ps, min(_LEFT_OUT_PS, 2.5 * config.equilibrate_ps))
         config = replace(config, starts="rollout", equilibrate_ps=left_out_ps)
@@ -172,9 +172,7 @@ def _starts(site: Site, record: RunRecord, config: MDConfig, files: list[Path]) 
         with suppress(SimulationError):
             frames = frames_over_states(rolled, 2 * len(files), seed=site.options.seed)
             in_time = _until(frames, _STARTING * decision.seconds("held-out md"))
-            return list(frames_as_starts(site.scene, config, in_time, len(files))[0]), config
-    # On one core, while the others wait.
-    hot_ps = min(HOT_PS, 1.2 * config.equilibrate_ps / rates.cores)
+            return list(frames_as_starts(site.scene, config, in_time, len(files), hot_ps=hot_ps)[0]), config
     return list(many_starts(site.scene, config, len(files), hot_ps=hot_ps)[0]), config
 
 
@@ -239,7 +237,7 @@ def _roll(site: Site, record: RunRecord) -> RunRecord:
     out = site.folder / f"trajectory/surrogate.{site.options.format}"
     out.parent.mkdir(exist_ok=True)
     rollout(
-        site.scene,
+        dry_part(site.scene),
         own if record.weights == WEIGHTS_NAME else record.weights,
         out,
         options=RolloutOptions(
@@ -251,8 +249,8 @@ def _roll(site: Site, record: RunRecord) -> RunRecord:
             replicas=rates.rolls.replicas,
             anneal_ps=min(_ANNEAL_PS, _ANNEAL * expected_ps) if rates.expensive else 0.0,
             torsion_moves=_TORSION_MOVES if rates.expensive else 0,
-            # Of a potential only the reference could mend frames; a replica that flies apart must not end the others.
-            guard="resample" if rates.expensive else "repair",
+            # Of a potential, and without the water, nothing could mend frames; one bad replica must not end the others.
+            guard="resample" if rates.expensive or site.config.force.is_explicit else "repair",
             resume=True,
             quiet=True,
         ),

@@ -119,6 +119,20 @@ def test_at_constant_pressure_and_without_a_solute(monkeypatch: pytest.MonkeyPat
     assert "nothing but water" in many_starts(water, npt, 2)[1]
 
 
+def test_frames_of_a_solute_are_set_in_its_water() -> None:
+    wet = solvate(SCENE, spec := ForceFieldSpec("ff14SB", "tip3p"), WaterBox())
+    frames = np.stack([scene.positions_nm for scene in many_starts(SCENE, conditions(), 3)[0]])
+    scenes, how = frames_as_starts(wet, Conditions(spec, seed=3), iter(frames), 4, hot_ps=20.0)
+    assert how.startswith("3 starting structures: frames of the rollout, their torsions set in water")
+    quads, solute = rotatable_torsions(SCENE), solute_of(wet)
+    for k, scene in enumerate(scenes):
+        assert scene.n_atoms == wet.n_atoms and scene.cell_nm is not None
+        off = torsion(scene.positions_nm[solute], quads) - torsion(frames[k % 3], quads)
+        assert np.abs(np.angle(np.exp(1j * off))).max() < 0.5
+    with pytest.raises(SimulationError, match="frames of 21 atoms are not of its solute, which has 22"):
+        frames_as_starts(wet, Conditions(spec, seed=3), frames[:, 1:], 4)
+
+
 def test_frames_that_are_another_molecule_are_no_starts() -> None:
     mirrored = SCENE.positions_nm * np.array([-1.0, 1.0, 1.0])
     frames = np.stack([mirrored, SCENE.positions_nm, np.full_like(mirrored, np.nan)])

@@ -51,7 +51,9 @@ def test_help_has_flexible_bonds_where_the_reference_had(domain: TrainingDomain,
 def test_weights_that_name_no_force_field_cannot_be_coupled(
     tmp_path: Path, scene: Scene, domain: TrainingDomain
 ) -> None:
-    for conditions, said in (({}, "their force_field"), ({**CONDITIONS, "force_field": "ff00"}, "ff00")):
+    wet = {**CONDITIONS, "solvent": "tip3p"}
+    unknown = {**CONDITIONS, "force_field": "ff00"}
+    for conditions, said in (({}, "their force_field"), (unknown, "ff00"), (wet, "a rollout has no water")):
         weights = weights_of(replace(domain, conditions=conditions))
         with pytest.raises(InputError, match=f"cannot be coupled to OpenMM.*{said}"):
             roll(tmp_path / "a.h5", scene, weights, "repair")
