@@ -6,8 +6,9 @@
 ff14SB, 300 K, 4 fs. Each batch is sixteen runs `FOLDER/{test,train}/NAME/run_000.h5`, ... that begin in other states:
 sixteen replicas in OBC2, 200 ps at 500 K and 500 ps at 300 K. In water (NVT at the volume of 1 bar, PME, frames 1 ps
 apart without water) the replicas are turned to the torsions of these; in OBC2 (the wide campaign, frames 5 ps apart)
-they go on from them. 50 ps after that are left out. The test set first, then what is trained on, in water in rounds.
-What is there is left alone and what was stopped goes on.
+they go on from them. 50 ps after that are left out. The test set first, then what is trained on; in water in rounds,
+the first of which has the monomers and every residue once at either place of a pair. What is there is left alone and
+what was stopped goes on.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from peptide_list import Peptide, training_peptides, unseen_peptides, wide_peptides
+from peptide_list import RESIDUES, Peptide, training_peptides, unseen_peptides, wide_peptides
 from processes import arguments_of, in_order, only_here, parts_of, run_path, simulate_runs
 
 from md_reference.forces.forcefield import build_system
@@ -36,13 +37,16 @@ from systems.scene import FloatArray, IntArray, Scene
 
 WATER, IMPLICIT = ForceFieldSpec("ff14SB", "tip3p"), ForceFieldSpec("ff14SB", "obc2")
 # Pairs and chains are not among the training peptides, in no solvent; monomers are tested on runs of their own.
-TEST = (
-    *(Peptide((name,), True, 16, 3000.0) for name in ("ALA", "PHE")),
-    *(Peptide(pair, True, 16, 3000.0) for pair in (("LEU", "SER"), ("LYS", "GLU"), ("VAL", "ASN"), ("PHE", "GLY"))),
-    *(Peptide(chain, True, 16, 3000.0) for chain in (("SER", "LEU", "ALA"), ("ALA", "SER", "VAL", "LEU"))),
-    *(Peptide(chain, False, 16, 3000.0) for chain in (("ILE", "GLN", "ALA", "PHE"), ("MET", "SER"))),
-)
-TRAINING_PS, ROUNDS, DISCARDED_PS = 1000.0, 6, 50.0
+TEST, FURTHER_TEST = (
+    tuple(Peptide(residues, capped, 16, 3000.0) for residues, capped in some)
+    for some in (
+        ((("ALA",), True), (("PHE",), True), (("LEU", "SER"), True), (("VAL", "ASN"), True),
+         (("SER", "LEU", "ALA"), True), (("MET", "SER"), False)),
+        ((("LYS", "GLU"), True), (("PHE", "GLY"), True), (("ALA", "SER", "VAL", "LEU"), True),
+         (("ILE", "GLN", "ALA", "PHE"), False)),
+    )
+)  # fmt: skip
+TRAINING_PS, ROUNDS, DISCARDED_PS = 500.0, 12, 50.0
 SAVED_PS = {"tip3p": 1.0, "obc2": 5.0}
 HOT_K, HOT_PS, COOL_PS = 500.0, 200.0, 500.0
 TURNED_PS, STIFFNESS_KJ_MOL = 20.0, 300.0
@@ -119,10 +123,12 @@ def order(solvent: str) -> list[tuple[str, Peptide, int]]:
     if solvent == IMPLICIT.solvent:
         return [(kind, p, 0) for kind, some in (("test", unseen_peptides()), ("train", wide_peptides())) for p in some]
     training = [Peptide(p.residues, p.capped, p.n_starts, TRAINING_PS) for p in training_peptides()]
+    first = training[: 2 * len(RESIDUES)]
+    rounds = [(TEST, first), (FURTHER_TEST, training[len(first) :]), *(((), training) for _ in range(ROUNDS - 1))]
     return [
-        (kind, peptide, number)
-        for number in range(ROUNDS)
-        for kind, peptides in (("test", TEST), ("train", training))
+        (kind, peptide, max(0, k - 1))
+        for k, both in enumerate(rounds)
+        for kind, peptides in zip(("test", "train"), both, strict=True)
         for peptide in peptides
     ]
 
