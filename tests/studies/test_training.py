@@ -9,11 +9,13 @@ from pathlib import Path
 
 import lag_errors
 import numpy as np
+import peptide_correction
 import peptide_runs
 import peptide_seeds
 import peptide_transfer
 import peptide_unseen
 import pytest
+from peptide_correction import CELLS, Correction
 from peptide_energies import wham
 from peptide_list import (
     FURTHER_PAIRS,
@@ -26,6 +28,7 @@ from peptide_list import (
     unseen_peptides,
     wide_peptides,
 )
+from peptide_scores import Turn
 
 from systems.errors import InputError
 from systems.prepare.peptide import build_peptide
@@ -183,3 +186,23 @@ def test_no_training_takes_what_is_tested_by(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="weights are tested on GLN-ILE"):
         peptide_transfer.sets_of([tmp_path / "train"], 16)
     assert peptide_transfer.trained_with({"from": {"from": {"positive_phi_kt": {"ALA": 4.0}}}}) == {"ALA": 4.0}
+
+
+def test_a_correction_weighs_frames_by_their_residues_maps(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    turns = [Turn(kind, r, (0, 1, 2, 3)) for r in (0, 1) for kind in ("phi", "psi")]
+    table = np.zeros((CELLS, CELLS))
+    table[CELLS // 2 :] = math.log(3.0)
+    correction = Correction(2.0, {"ALA": table})
+    run = np.array([[-1.0, 0, 1, 0], [1.0, 0, -1, 0]])
+    weights = correction.weights(turns, ["ALA", "GLY"], run)
+    assert weights[1] / weights[0] == pytest.approx(3.0) and weights.mean() == pytest.approx(1.0)
+    assert correction.weights(turns, ["ALA", "ALA"], run) == pytest.approx(np.ones(2))
+    for place in ("there/ALA", "here/ALA", "there/ALA-GLY", "here/ALA-GLY", "there/GLY"):
+        (tmp_path / place).mkdir(parents=True)
+        (tmp_path / place / "run_000.h5").touch()
+    maps = {"there": table + 2.0, "here": table + 1.0}
+    monkeypatch.setattr(peptide_correction, "_map_and_time", lambda runs: (
+        np.exp(maps[runs[0].parts[-3]]), 30.0 if "there" in runs[0].parts else 20.0))  # fmt: skip
+    found = Correction.of(tmp_path / "there", tmp_path / "here")
+    assert found.clock == 1.5 and found.log_ratio.keys() == {"ALA"}
+    assert found.log_ratio["ALA"] == pytest.approx(np.ones((CELLS, CELLS)))

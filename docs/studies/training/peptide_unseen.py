@@ -1,7 +1,7 @@
 """Weights for peptides on molecules that they never saw, beside MD of these.
 
     python docs/studies/training/peptide_unseen.py FOLDER --weights W --test CAMPAIGN/test [--solvent tip3p]
-                                                   [--molecules NAME ...] [-o TABLE.json]
+                               [--corrected THERE/train HERE/train] [--molecules NAME ...] [-o TABLE.json]
 
 Of each molecule the weights roll as many runs as MD has, of MD's first 10 ns the same, unguarded, at lags of 10 ps,
 100 ps and 1 ns (FOLDER/NAME). Torsions: mean Jensen-Shannon distance (root, natural logarithm, 50
@@ -9,7 +9,8 @@ bins) over φ, ψ and χ, of one run to all others' MD (single), and of half of 
 that of MD itself; joint maps of ψ and the next φ (36 x 36) pooled. Kinetics: integrated correlation times of every cos
 ψ and along the two slowest TICA coordinates of MD, over MD's; of MD's halves beside it. Lags: root mean square
 difference of the populations of torsion states at 100 ps and 1 ns from those at 10 ps, over what MD's halves differ.
-What is there is read.
+`--corrected`: rollouts in one solvent (HERE) weighed and stretched as runs of monomers in another say
+(`peptide_correction`). What is there is read.
 """
 
 from __future__ import annotations
@@ -24,6 +25,7 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+from peptide_correction import Correction
 from peptide_rollouts import FRAMES_PS, rolled, thinned
 from peptide_scores import angles, turns_of
 
@@ -41,18 +43,20 @@ Runs = Sequence[FloatArray]
 RUN_PS, LAGS_PS, BINS, JOINT_BINS, HALVES, SEED = 10_000.0, (100.0, 1000.0), 50, 36, 10, 0
 
 
-def densities(runs: Runs, bins: int = BINS) -> list[FloatArray]:
-    """Return of each run the histograms of every torsion, `(n_torsions, bins)`."""
-    edges = np.linspace(-math.pi, math.pi, bins + 1)
-    return [np.stack([np.histogram(x, edges)[0] for x in run.T]).astype(np.float64) for run in runs]
+def densities(runs: Runs, weights: Runs | None = None) -> list[FloatArray]:
+    """Return of each run the histograms of every torsion, `(n_torsions, BINS)`."""
+    edges = np.linspace(-math.pi, math.pi, BINS + 1)
+    return [np.stack([np.histogram(x, edges, weights=w)[0] for x in run.T]).astype(np.float64)
+            for run, w in zip(runs, weights or [None] * len(runs), strict=True)]  # fmt: skip
 
 
-def joint_densities(runs: Runs, pairs: Sequence[tuple[int, int]]) -> list[FloatArray]:
+def joint_densities(
+    runs: Runs, pairs: Sequence[tuple[int, int]], weights: Runs | None = None
+) -> list[FloatArray]:  # fmt: skip
     """Return of each run the joint histograms of pairs of torsions, `(n_pairs, JOINT_BINS ** 2)`."""
     edges = np.linspace(-math.pi, math.pi, JOINT_BINS + 1)
-    return [
-        np.stack([np.histogram2d(run[:, i], run[:, j], (edges, edges))[0].ravel() for i, j in pairs]) for run in runs
-    ]
+    return [np.stack([np.histogram2d(run[:, i], run[:, j], (edges, edges), weights=w)[0].ravel() for i, j in pairs])
+            for run, w in zip(runs, weights or [None] * len(runs), strict=True)]  # fmt: skip
 
 
 def mean_distance(one: FloatArray, other: FloatArray) -> float:
@@ -116,7 +120,9 @@ def lag_errors(md: Runs, at_10: Runs, others: dict[float, Runs]) -> dict[str, fl
             for lag, x in others.items()}  # fmt: skip
 
 
-def molecule(weights: Weights, runs: Sequence[Path], folder: Path, solvent: str | None) -> dict[str, Any]:
+def molecule(
+    weights: Weights, runs: Sequence[Path], folder: Path, solvent: str | None, correction: Correction | None = None
+) -> dict[str, Any]:  # fmt: skip
     """Roll a molecule and return its line of the table."""
     scene, md_nm, time_ps = thinned(runs)
     time_ps = min(time_ps, RUN_PS)
@@ -137,13 +143,18 @@ def molecule(weights: Weights, runs: Sequence[Path], folder: Path, solvent: str 
     psi = [k for k, t in enumerate(turns) if t.kind == "psi"]
     pairs = [(k, at["phi", t.residue + 1]) for k, t in enumerate(turns)
              if t.kind == "psi" and ("phi", t.residue + 1) in at]  # fmt: skip
+    amino_acids = [name for name in scene.residue_names if name not in ("ACE", "NME")]
+    shares = None if correction is None else [correction.weights(turns, amino_acids, x) for x in of]
+    one = densities(md), densities(of, shares)
+    joint = (joint_densities(md, pairs), joint_densities(of, pairs, shares)) if pairs else None
+    clock = 1.0 if correction is None else correction.clock
     return {
         "frames": sum(map(len, md)),
-        "torsions, single": over(single, densities(md), densities(of)),
-        "torsions, pooled": over(pooled, densities(md), densities(of)),
-        "joint maps, pooled": over(pooled, joint_densities(md, pairs), joint_densities(of, pairs)) if pairs else None,
+        "torsions, single": over(single, *one),
+        "torsions, pooled": over(pooled, *one),
+        "joint maps, pooled": None if joint is None else over(pooled, *joint),
         "MD's own, single": float(single(densities(md), densities(md)).mean()),
-        "kinetics": kinetics(md, of, psi),
+        "kinetics": {name: clock * ratio for name, ratio in kinetics(md, of, psi).items()},
         "kinetics of MD's halves": kinetics(md[: len(md) // 2], md[len(md) // 2 :], psi),
         "lags": lag_errors(md, of, {lag: [angles(turns, x) for x in roll(lag)] for lag in LAGS_PS}),
         "valid, %: MD, model": valid,
@@ -176,15 +187,17 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--weights", required=True)
     parser.add_argument("--test", type=Path, required=True)
     parser.add_argument("--solvent")
+    parser.add_argument("--corrected", type=Path, nargs=2, metavar=("THERE", "HERE"))
     parser.add_argument("--molecules", nargs="+")
     parser.add_argument("-o", "--out", type=Path)
     a = parser.parse_args(arguments)
     weights, rows = load_weights(weights_path(a.weights)), {}
+    correction = Correction.of(*a.corrected) if a.corrected else None
     for place in sorted(a.test.iterdir()):
         runs = sorted(place.glob("run_*.h5"))
         if len(runs) < 4 or (a.molecules and place.name not in a.molecules):
             continue
-        rows[place.name] = molecule(weights, runs, a.folder / place.name, a.solvent)
+        rows[place.name] = molecule(weights, runs, a.folder / place.name, a.solvent, correction)
         sys.stdout.write(f"{place.name}: {json.dumps(rows[place.name], ensure_ascii=False)}\n")
         sys.stdout.flush()
     if not rows:
