@@ -3,12 +3,12 @@
     python docs/studies/training/peptide_campaign.py FOLDER --budget 3h [--workers 1] [--solvent obc2]
     python docs/studies/training/peptide_campaign.py FOLDER --list [--solvent obc2]
 
-ff14SB, 300 K, 4 fs. Each batch is sixteen runs `FOLDER/{test,train}/NAME/run_000.h5`, ... that begin in other states:
-sixteen replicas in OBC2, 200 ps at 500 K and 500 ps at 300 K. In water (NVT at the volume of 1 bar, PME, frames 1 ps
-apart without water) the replicas are turned to the torsions of these; in OBC2 (the wide campaign, frames 5 ps apart)
-they go on from them. 50 ps after that are left out. The test set first, then what is trained on; in water in rounds,
-the first of which has the monomers and every residue once at either place of a pair. What is there is left alone and
-what was stopped goes on.
+ff14SB, 300 K, 4 fs. Each batch is sixteen runs `FOLDER/{test,train,fine}/NAME/run_000.h5`, ... that begin in other
+states: sixteen replicas in OBC2, 200 ps at 500 K and 500 ps at 300 K. In water (NVT at the volume of 1 bar, PME, frames
+1 ps apart without water) the replicas are turned to the torsions of these; in OBC2 (the wide campaign, frames 5 ps
+apart) they go on from them, those of `fine` 300 ps long and frames 1 ps apart. 50 ps after that are left out. The test
+set first, then what is trained on; in water in rounds, the first of which has the monomers and every residue once at
+either place of a pair. What is there is left alone and what was stopped goes on.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ from __future__ import annotations
 import sys
 import zlib
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -48,6 +49,7 @@ TEST, FURTHER_TEST = (
 )  # fmt: skip
 TRAINING_PS, ROUNDS, DISCARDED_PS = 500.0, 12, 50.0
 SAVED_PS = {"tip3p": 1.0, "obc2": 5.0}
+FINE_PS, FINE_SAVED_PS = 300.0, 1.0
 HOT_K, HOT_PS, COOL_PS = 500.0, 200.0, 500.0
 TURNED_PS, STIFFNESS_KJ_MOL = 20.0, 300.0
 
@@ -93,7 +95,7 @@ def starts_in_water(wet: Scene, quads: IntArray, angles: FloatArray, seed: int) 
     return run.positions_nm
 
 
-def batch(folder: Path, peptide: Peptide, number: int, solvent: str) -> None:
+def batch(folder: Path, peptide: Peptide, number: int, solvent: str, every_ps: float) -> None:
     """Simulate the batch of this number, from wherever it stands. Raises SimulationError, KeyboardInterrupt."""
     numbers = range(number * n_replicas(), (number + 1) * n_replicas())
     if all(run_path(folder, k).exists() for k in numbers):
@@ -113,7 +115,7 @@ def batch(folder: Path, peptide: Peptide, number: int, solvent: str) -> None:
                 starts = starts_in_water(scene, quads, np.asarray(torsion(starts, quads), dtype=np.float64), seed)
         config = MDConfig(
             force=WATER if in_water else IMPLICIT, time_ps=peptide.time_ps, equilibrate_ps=DISCARDED_PS, seed=seed,
-            platform=SIMD, keep="solute" if in_water else "all", save_every_ps=SAVED_PS[solvent],
+            platform=SIMD, keep="solute" if in_water else "all", save_every_ps=every_ps,
         )  # fmt: skip
         simulate_runs(scene, config, folder, numbers, starts_nm=starts)
 
@@ -121,8 +123,10 @@ def batch(folder: Path, peptide: Peptide, number: int, solvent: str) -> None:
 def order(solvent: str) -> list[tuple[str, Peptide, int]]:
     """Return every batch: where its files go, the molecule and the number."""
     if solvent == IMPLICIT.solvent:
-        return [(kind, p, 0) for kind, some in (("test", unseen_peptides()), ("train", wide_peptides())) for p in some]
-    training = [Peptide(p.residues, p.capped, p.n_starts, TRAINING_PS) for p in training_peptides()]
+        fine = [replace(p, time_ps=FINE_PS) for p in training_peptides()[: 2 * len(RESIDUES)]]
+        kinds = (("test", unseen_peptides()), ("fine", fine), ("train", wide_peptides()))
+        return [(kind, p, 0) for kind, some in kinds for p in some]
+    training = [replace(p, time_ps=TRAINING_PS) for p in training_peptides()]
     first = training[: 2 * len(RESIDUES)]
     rounds = [(TEST, first), (FURTHER_TEST, training[len(first) :]), *(((), training) for _ in range(ROUNDS - 1))]
     return [
@@ -135,7 +139,8 @@ def order(solvent: str) -> list[tuple[str, Peptide, int]]:
 
 def make(task: tuple[str, Peptide, int], deadline: float, folder: str, solvent: str) -> None:
     kind, peptide, number = task
-    batch(Path(folder) / kind / peptide.name, peptide, number, solvent)
+    every_ps = FINE_SAVED_PS if kind == "fine" else SAVED_PS[solvent]
+    batch(Path(folder) / kind / peptide.name, peptide, number, solvent, every_ps)
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
