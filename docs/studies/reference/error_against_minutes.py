@@ -200,8 +200,10 @@ class LongMD:
         ensemble = stretch(whole, round(LEFT_OUT_PS / whole.lag_ps), None)
         if longer := sorted((files[0].parent / LONGER).glob("[!.]*.h5")):
             later = load_ensemble(longer, template=whole.scene)
+            every = round(later.lag_ps / ensemble.lag_ps)
             pairs = zip(ensemble.segments, later.segments, strict=True)
-            ensemble = replace(ensemble, segments=[np.concatenate(pair) for pair in pairs])
+            segments = [np.concatenate([np.asarray(s[every - 1 :: every]), np.asarray(x)]) for s, x in pairs]
+            ensemble = replace(ensemble, segments=segments, lag_ps=later.lag_ps, flags=None, chunk_idx=None)
         baseline = Baseline.of(ensemble, parent=ensemble.scene, kept=ensemble.kept)
         angles = measured(baseline, ensemble)
         halves = ({k: x[: len(x) // 2] for k, x in angles.items()}, {k: x[len(x) // 2 :] for k, x in angles.items()})
@@ -217,7 +219,7 @@ class LongMD:
     def errors_of_beginning(self, first_ps: float) -> tuple[float, float]:
         """Return the errors of the first part of the reference's own replicas, beside the rest of it."""
         own = self.load(self.files, first_ps)
-        n = max(0, len(own.segments[0]) - round(LEFT_OUT_PS / own.lag_ps))
+        n = max(0, round((len(own.segments[0]) * own.lag_ps - LEFT_OUT_PS) / self.ensemble.lag_ps))
         rest = {k: [x[n:] for x in segments] for k, segments in self.angles.items()}
         angles, weights = measured(self.baseline, own), own_weights(own)
         return torsion_distance(rest, angles, weights), population_error(rest, angles, weights)
