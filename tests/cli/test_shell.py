@@ -35,7 +35,7 @@ def completed(words: str) -> list[str]:
         ("surromd rollout alanine-dipeptide --weights pa", ["paracetamol-gfn2-xtb"]),
         ("surromd rollout alanine-dipeptide --guard re", ["resample", "repair"]),
         ("surromd rollout alanine-dipeptide --save-e", ["--save-every"]),
-        ("surromd rollout alanine-dipeptide --solv", []),
+        ("surromd rollout alanine-dipeptide --solver", []),
     ],
 )
 def test_a_shell_completes(words: str, said: list[str]) -> None:

@@ -302,14 +302,16 @@ def train_peptides(
 def peptides_domain(sets: Sequence[TrainingFrames], config: PeptideConfig) -> TrainingDomain:
     """Return the domain of weights for peptides: of each solvent the smallest molecules, whose own frames say what is
     valid, and the names of all others."""
-    by_solvent: dict[str, dict[str, TrainingFrames]] = {}
+    smallest: dict[str, dict[str, TrainingFrames]] = {}
     for frames in sorted(sets, key=lambda frames: (frames.scene.n_atoms, frames.lag_ps)):
-        of_solvent = by_solvent.setdefault(str(frames.conditions.get("solvent")), {})
+        of_solvent = smallest.setdefault(str(frames.conditions.get("solvent")), {})
         of_solvent.setdefault("-".join(frames.scene.residue_names), frames)
     found: list[TrainingDomain] = []
-    for some in by_solvent.values():
-        whole = [training_domain(f, strides=_strides(config, f)) for f in list(some.values())[:_WHOLE]]
-        found += [replace(whole[0], sequences=tuple(some)[_WHOLE:]), *whole[1:]]
+    for solvent in config.solvents or smallest:
+        some = smallest.get(solvent, {})
+        kept = list(map(id, list(some.values())[:_WHOLE]))
+        whole = [training_domain(f, strides=_strides(config, f)) for f in sets if id(f) in kept]
+        found += [replace(one, sequences=tuple(some)[_WHOLE:] if one is whole[0] else ()) for one in whole]
     # One molecule says nothing of others, whatever the weights covered that it was trained from.
     several = len({f.scene.topology_hash for f in sets}) > 1
     return replace(found[0], further=tuple(found[1:]), transferable=several)

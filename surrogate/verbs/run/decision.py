@@ -174,7 +174,7 @@ def _choose(rates: Rates, budget_s: float, way: str) -> tuple[Way, tuple[str, ..
         # Where neither comes to anything it pays at quantum level.
         pays = best < (1.0 if rates.expensive else _PAYS) * by_md or (rates.expensive and best == by_md)
         by_each = ", ".join(f"{100 * error:.2g} % by {name}" for name, error in errors.items())
-        said = f"error to expect of a population: {by_each}, with {rates.relaxation_words}"
+        said = f"error to expect of populations: {by_each}, with {rates.relaxation_words}"
         if min(errors.values()) >= _MOST_ERROR:
             said = f"no way is sure to see enough with {rates.relaxation_words}; a rollout sees most of it"
         why = (rates.coverage, said)
@@ -215,7 +215,8 @@ def expected_errors(
     model_error: float = MODEL_ERROR,
     rolled: Sequence[float] = _ROLLED,
 ) -> dict[str, float]:
-    """Return the error to expect of the population of a state at the end of a budget, by each way to spend it.
+    """Return the root mean square error to expect of the populations of torsion states at the end of a budget, by each
+    way to spend it; `relaxation_ps`: the usual one of states (`usual_relaxation`) unless given.
 
     `hypot(sqrt(relaxation / (2 length)), start (1 - exp(-t)) / t)`: what few independent samples leave (they are two
     relaxation times apart: Mueller-Krumbhaar and Binder, J. Stat. Phys. 8, 1 (1973)) of a `length` of all replicas
@@ -224,7 +225,7 @@ def expected_errors(
     that the states may have. A rollout is off by `model_error` (0.1 unless given) as well; MD and a rollout that has
     one of the shares `rolled` of the time count each by its error.
     """
-    relaxation_ps = max(rates.relaxation_ps if relaxation_ps is None else relaxation_ps, 1e-3)
+    relaxation_ps = max(rates.usual_ps if relaxation_ps is None else relaxation_ps, 1e-3)
     seconds = (1.0 - _REPORT_SHARE) * budget_s
 
     def error(ps_per_s: float, replicas: int, share: float, start: float) -> float:

@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+import math
 import tempfile
 import threading
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from hashlib import sha256
 from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING
+
+import numpy as np
+import numpy.typing as npt
 
 from md_reference.forces.spec import QUANTUM, QUANTUM_SOLVENTS
 from md_reference.run.config import SIMD, MDConfig
@@ -39,13 +44,15 @@ _MOST_ATOMS_BY_SIMD = 3000
 @dataclass(frozen=True)
 class Rolls:
     """How weights (a name or a file) roll: frames `lag_ps` apart, ps in a second of wall time, replicas together;
-    `relaxation_ps` of the slowest motion in the rollouts that were measured, 0 where they are too short to show one."""
+    `relaxation_ps` of the slowest motion in the rollouts that were measured, and `usual_ps` of all torsion states, by
+    which their populations become known (`usual_relaxation_ps`); 0 where rollouts are too short to show them."""
 
     weights: str
     lag_ps: float
     ps_per_s: float
     replicas: int = REPLICAS
     relaxation_ps: float = 0.0
+    usual_ps: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -84,10 +91,16 @@ class Rates:
         return (self.rolls.relaxation_ps if self.rolls else 0.0) or UNSEEN_PS
 
     @property
+    def usual_ps(self) -> float:
+        """The relaxation by which the populations of all torsion states become known, ps."""
+        return (self.rolls.usual_ps if self.rolls else 0.0) or self.relaxation_ps
+
+    @property
     def relaxation_words(self) -> str:
-        """The same in words."""
+        """Both in words."""
         seen = "as the first rollouts show" if self.rolls and self.rolls.relaxation_ps else "assumed"
-        return f"a slowest relaxation of {format_time_ps(self.relaxation_ps, 2)}, {seen}"
+        usual = f", that of states {format_time_ps(self.usual_ps, 2)}" if self.usual_ps != self.relaxation_ps else ""
+        return f"a slowest relaxation of {format_time_ps(self.relaxation_ps, 2)}{usual}, {seen}"
 
     @property
     def openmm_ps_per_s(self) -> float:
@@ -179,7 +192,7 @@ def rollout_rate(scene: Scene, weights: Weights, temperature_k: float, stretch: 
     lag_ps = weights.domain.lag_ps
     if weights.domain.jumps:
         lag_ps = min(max(LONG_LAG_PS, lag_ps), weights.domain.longest_lag_ps)
-    replicas, relaxation_ps = REPLICAS, 0.0
+    replicas, relaxations_ps = REPLICAS, (0.0, 0.0)
     seen_ps = min(_FURTHER * lag_ps, weights.domain.longest_lag_ps) if weights.domain.jumps else lag_ps
     if isinstance(weights.model, Potential):  # so many steps a frame that one frame tells
         weights, replicas = in_bath(weights, {"n_new": 1}), max(_POTENTIAL_REPLICAS, _REPLICAS_A_CORE * cores)
@@ -196,25 +209,48 @@ def rollout_rate(scene: Scene, weights: Weights, temperature_k: float, stretch: 
             flush_every_s=3600.0,
         )
         if not isinstance(weights.model, Potential):
-            relaxation_ps = _slowest_ps(files)
+            relaxations_ps = _relaxations_ps(files)
     # As of MD the fastest batch counts: the first chunk makes what all others use again, the last one is flushed. Where
     # other work interrupts them all, processor time tells what a chunk takes; on several cores by itself, wall time.
     passed = [(wall - wall0, own - own0) for (wall0, own0), (wall, own) in pairwise(seen[:-1])]
     fastest_s = max(min(min(both) for both in passed), 1e-6)
     name = weights.path.stem if shipped_weights().get(weights.path.stem) == weights.path else str(weights.path)
     ps_per_s = replicas * weights.model.n_new * lag_ps / fastest_s / stretch
-    return Rolls(name, lag_ps, ps_per_s, replicas, relaxation_ps)
+    return Rolls(name, lag_ps, ps_per_s, replicas, *relaxations_ps)
 
 
-def _slowest_ps(files: list[Path]) -> float:
-    """Return the longest integrated correlation time in trajectories, about the mean of all."""
-    from surrogate.comparison.measure.slow_motion import longest_correlation
+def _relaxations_ps(files: list[Path]) -> tuple[float, float]:
+    """Return the longest integrated correlation time in trajectories, about the mean of all, and the usual one of
+    torsion states."""
+    from surrogate.comparison.measure.slow_motion import angles_of, longest_correlation
     from surrogate.comparison.measure.structure import Baseline
     from surrogate.comparison.read.ensemble import load_ensemble
 
     rolled = load_ensemble(files)
-    measured = Baseline.of(rolled, parent=rolled.scene, kept=rolled.kept).measure(rolled)
-    return round(longest_correlation(measured) * rolled.lag_ps, 3)
+    baseline = Baseline.of(rolled, parent=rolled.scene, kept=rolled.kept)
+    measured = baseline.measure(rolled)
+    usual = usual_relaxation([segments for _, segments in angles_of([measured], baseline.torsions)])
+    return round(longest_correlation(measured) * rolled.lag_ps, 3), round(usual * rolled.lag_ps, 3)
+
+
+def usual_relaxation(torsions: Sequence[Sequence[npt.NDArray[np.floating]]]) -> float:
+    """Return the relaxation time, in frames, of a process between two equal states whose populations are as uncertain
+    as, in the mean square, those of all states of `torsions`, runs of angles in rad each: 4 <τ p (1 - p)>, τ the
+    correlation time of being in a state of population p. 0 where no torsion has two states."""
+    from surrogate.comparison.measure.kinetics import zero_crossing
+    from surrogate.comparison.measure.torsions import find_wells
+
+    found: list[float] = []
+    for segments in torsions:
+        wells = find_wells(segments)
+        if len(wells.names) < 2:
+            continue
+        states = wells.assign(segments)
+        for state in range(len(wells.names)):
+            inside = [(x == state).astype(np.float64) for x in states]
+            share, frames = float(np.concatenate(inside).mean()), zero_crossing(inside)[1]
+            found.append(frames * share * (1.0 - share) if math.isfinite(frames) else 0.0)
+    return 4.0 * float(np.mean(found)) if found else 0.0
 
 
 def _covering(scene: Scene, config: MDConfig, named: str | Path | None) -> tuple[Weights | None, str]:

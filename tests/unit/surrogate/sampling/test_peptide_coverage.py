@@ -155,7 +155,7 @@ def test_of_many_peptides_the_larger_are_known_by_their_residues(
 ) -> None:
     monkeypatch.setattr(trainer, "_WHOLE", 2)
     domain = trainer.peptides_domain([trembling(name) for name in reversed(TRAINED)], weights.model.config)
-    assert [d.scene.name for d in domain.members] == list(TRAINED[:2]) and domain.sequences == TRAINED[2:]
+    assert [d.scene.name for d in domain.members] == list(TRAINED[1::-1]) and domain.sequences == TRAINED[2:]
     assert built(TrainingDomain, domain.to_dict()).sequences == domain.sequences and "3 molecules" in domain.describe()
     pair = build_peptide(TRAINED[2])
     for known, seen in ((domain, True), (replace(domain, sequences=()), False)):

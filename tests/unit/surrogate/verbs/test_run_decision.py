@@ -41,6 +41,9 @@ def test_where_md_forgets_its_start_too_slowly_a_rollout_finds_the_states() -> N
     assert able.way == "rollout" and able.seconds("held-out md") > 2 * able.seconds("rollout")
     assert found.expected_rollout_ps == pytest.approx(16_000.0 * found.seconds("rollout"))
     assert "a slowest relaxation of 20 ns, as the first rollouts show" in found.why[1]
+    usual = replace(slow, rolls=replace(fast, relaxation_ps=20_000.0, usual_ps=20.0))
+    assert decide(usual, 60.0).way == "md", "nor where most states are known at once"
+    assert "a slowest relaxation of 20 ns, that of states 20 ps" in decide(usual, 60.0).why[1]
     quick = replace(COVERED, rolls=replace(fast, relaxation_ps=20.0))
     assert decide(quick, 60.0).way == "md", "what MD forgets at once needs no rollout"
     lame = replace(slow, rolls=replace(FAST, ps_per_s=10.0, relaxation_ps=20_000.0))

@@ -142,7 +142,7 @@ def test_the_rate_is_that_of_a_rollout_of_so_many_replicas(
 
     weights = load_weights(weights_path(name))
     monkeypatch.setattr("surrogate.sampling.runner.rollout", rollout)
-    monkeypatch.setattr(measuring, "_slowest_ps", lambda files: 40.0)
+    monkeypatch.setattr(measuring, "_relaxations_ps", lambda files: (40.0, 8.0))
     clocks = {"monotonic": iter(wall_s).__next__, "process_time": iter(processor_s).__next__}
     monkeypatch.setattr(measuring, "time", SimpleNamespace(**clocks))
     found = rollout_rate(weights.domain.scene, weights, 300.0, 2.0, 4)
@@ -163,13 +163,14 @@ def test_weights_for_several_lags_are_measured_by_long_steps(monkeypatch: pytest
             progress(k, 3, "")
 
     monkeypatch.setattr("surrogate.sampling.runner.rollout", rollout)
-    monkeypatch.setattr(measuring, "_slowest_ps", lambda files: 1_500.0)
+    monkeypatch.setattr(measuring, "_relaxations_ps", lambda files: (1_500.0, 200.0))
     weights = load_weights(weights_path("peptides"))
     rolls = rollout_rate(build_peptide("ACE-ALA-NME"), weights, 300.0, 1.0, 1)
     assert rolls.lag_ps == 10.0 and asked[0].save_every_ps == 100.0
     assert asked[0].time_ps == 6 * weights.model.n_new * 100.0
     rates = replace(found(), rolls=rolls)
-    assert rates.relaxation_words == "a slowest relaxation of 1.5 ns, as the first rollouts show"
+    assert rates.relaxation_words == "a slowest relaxation of 1.5 ns, that of states 200 ps, as the first rollouts show"
+    assert rates.usual_ps == 200.0 and found().usual_ps == found().relaxation_ps
     assert found().relaxation_words == "a slowest relaxation of 1 ns, assumed"
 
 
@@ -183,4 +184,28 @@ def test_the_slowest_relaxation_is_that_of_a_torsion_that_jumps(monkeypatch: pyt
         frames = (frames + 1e-3 * rng.standard_normal(frames.shape)).astype(np.float32)
         rolled = Ensemble("rolled", list(frames), 100.0, scene)
         monkeypatch.setattr("surrogate.comparison.read.ensemble.load_ensemble", lambda files, rolled=rolled: rolled)
-        assert 0.6 < measuring._slowest_ps([]) / (100.0 * tau) < 1.7
+        slowest_ps, usual_ps = measuring._relaxations_ps([])
+        assert 0.6 < slowest_ps / (100.0 * tau) < 1.7
+        assert usual_ps <= slowest_ps
+
+
+def test_the_usual_relaxation_of_states_is_that_of_their_populations() -> None:
+    rng = np.random.default_rng(3)
+
+    def jumping(tau: float, share: float) -> list[np.ndarray]:
+        """Eight runs of an angle between two states, the first of that share, forgotten after `tau` frames."""
+        runs = []
+        for _ in range(8):
+            state = [rng.random() < share]
+            for _ in range(4999):
+                state.append(rng.random() < share if rng.random() < -np.expm1(-1.0 / tau) else state[-1])
+            runs.append(np.where(state, -1.5, 1.5) + 0.2 * rng.standard_normal(5000))
+        return runs
+
+    slow, fast, rare = jumping(40.0, 0.5), jumping(4.0, 0.5), jumping(40.0, 0.1)
+    assert measuring.usual_relaxation([slow]) == pytest.approx(40.0, rel=0.25)
+    assert measuring.usual_relaxation([slow, fast]) == pytest.approx(22.0, rel=0.25), "the mean of both"
+    assert measuring.usual_relaxation([rare]) == pytest.approx(40.0 * 4 * 0.09, rel=0.35), (
+        "what is rare is known sooner"
+    )
+    assert measuring.usual_relaxation([[0.1 * rng.standard_normal(500)]]) == 0.0
