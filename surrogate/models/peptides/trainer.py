@@ -213,6 +213,8 @@ def train_peptides(
         config = replace(start.model.config, usual_steps=kept.usual_steps, usual_solver=kept.usual_solver,
                          coupled=start.model.config.coupled or config.coupled)  # fmt: skip
     config = with_scale(in_solvents(config, sets, start), sets)
+    if training.tuned == "solvent" and not config.solvents:
+        raise InputError("`tuned='solvent'` is for frames in another solvent than that of the weights.")
     device = torch.device(training.device)
     model = PeptideSlide(config).to(device)
     subjects, held_out = (

@@ -385,6 +385,9 @@ def test_weights_of_two_solvents_know_which_is_meant(frames: TrainingFrames, tmp
     wet = in_water(frames)
     first = load_weights(train_peptides([frames], tmp_path / "a.safetensors", SMALL, PeptideTraining(steps=2)))
     assert first.model.config.solvents == () and first.model.flow.of_solvent is None
+    alone = PeptideTraining(steps=2, tuned="solvent")
+    with pytest.raises(InputError, match="another solvent than that of the weights"):
+        train_peptides([frames], tmp_path / "no.safetensors", SMALL, alone, start=first)
     found = {
         tuned: load_weights(
             train_peptides([wet], tmp_path / f"{tuned}.safetensors", SMALL,
