@@ -43,8 +43,9 @@ _LEAST_UNITS = 8
 _PRIOR_PIECES, _LEAST_DRAWN, _SLOW_LAGS = 32, 0.05, 5.0
 # What averages over frames of connected states count for beside transitions: crossings of a slow process at most.
 _AVERAGES_CROSSINGS = 4.0
-# Fewer transitions of the slowest process, in its rarer direction, tell no populations.
-_LEAST_CROSSINGS = 5
+# Fewer transitions of a slow process, in its rarer direction, tell no populations, but of what it leads to and has a
+# share no larger than this: that is off by a factor, and all else hardly.
+_LEAST_CROSSINGS, _RARE = 5, 0.05
 # What has fewer frames than this share is not named as missing.
 _NAMED_SHARE = 0.005
 
@@ -61,6 +62,13 @@ class Unconnected(NamedTuple):
     fate: Fate
 
 
+class Rare(NamedTuple):
+    """States of a small share: which microstates, and how often MD was seen to come and go, in the rarer direction."""
+
+    microstates: tuple[int, ...]
+    crossings: int
+
+
 @dataclass(frozen=True, eq=False)
 class Equilibrium:
     """What MD says of equilibrium.
@@ -71,8 +79,9 @@ class Equilibrium:
     errors; `crossings`: how often the slowest process was seen, in the rarer direction. `populations` `(n_micro,)`, 0
     outside the connected set; `draws` `(n_draws, n_micro)` of a bootstrap over replicas, whose multiplicities are
     `resampled` `(n_draws, n_units)`; `unit_of` says for each unit which replica and which frames it is. `weights`: of
-    every frame, one array a replica, mean 1 over all. `unconnected`: what has no weight. `n_own`: how many replicas are
-    MD; those behind are images of them.
+    every frame, one array a replica, mean 1 over all. `unconnected`: what has no weight; `rare`: what has little and
+    was seen to come and go a few times, slower than all else; `seen`: whether what is as slow and not rare was seen
+    often enough. `n_own`: how many replicas are MD; those behind are images of them.
     """
 
     method: Literal["Markov model", "plain averages"]
@@ -90,12 +99,13 @@ class Equilibrium:
     weights: tuple[FloatArray, ...]
     unconnected: tuple[Unconnected, ...]
     n_own: int
+    rare: tuple[Rare, ...] = ()
+    seen: bool = True
 
     @property
     def holds(self) -> bool:
         """Whether the model passed its tests and rests on more than a few transitions; plain averages need none."""
-        seen = self.crossings >= _LEAST_CROSSINGS or not len(self.timescales)
-        return self.method == "plain averages" or (self.flat and self.ck_holds and seen)
+        return self.method == "plain averages" or (self.flat and self.ck_holds and self.seen)
 
     def shares(
         self, micro: Sequence[IntArray], labels: Sequence[IntArray], n: int, factors: Sequence[FloatArray] | None = None
@@ -162,6 +172,10 @@ def equilibrium(micro: Sequence[IntArray], *, lag: int | None = None, seed: int 
 
     populations = found_by(np.ones(len(units)), averages, 0.0)
     draws = np.array([found_by(m, averages.shifted(rng)) for m in resampled])
+    rare, seen = _rare(model, micro, populations)
+    for of in rare:
+        draws[:, of.microstates] *= np.exp(math.sqrt(2.0 / of.crossings) * rng.normal(size=(len(draws), 1)))
+        draws /= draws.sum(1, keepdims=True)
     with warnings.catch_warnings():  # of a process that is in no draw
         warnings.simplefilter("ignore", RuntimeWarning)
         errors = np.nanstd(times, axis=0, ddof=1)
@@ -172,7 +186,7 @@ def equilibrium(micro: Sequence[IntArray], *, lag: int | None = None, seed: int 
     ck_error, ck_holds = _chapman_kolmogorov(model, micro, units, resampled[:20])
     found = Equilibrium(
         "Markov model", model.lag, model.times, errors, flat, ck_error, ck_holds, model.crossings(micro),
-        populations, draws, resampled, tuple(units), (), unconnected, len(micro),
+        populations, draws, resampled, tuple(units), (), unconnected, len(micro), rare, seen,
     )  # fmt: skip
     if n_frames.min() >= _OUTLASTS * slowest and not lost and found.crossings > 0:
         return _averaged(found, micro, round(_LEFT_OUT * slowest))
@@ -397,18 +411,19 @@ class _Model:
 
     def crossings(self, micro: list[IntArray]) -> int:
         """Return how often the slowest process is seen in its rarer direction, at steps of the lag."""
-        return self._crossed(self.sides[0], micro)
+        return self.crossed(self.sides[0], micro)
 
     def most_crossings(self, micro: list[IntArray]) -> int:
         """Return the same of whichever of the slow processes was seen most often; some lags are not slow."""
-        return max(self._crossed(of, micro) for of in self.slow_sides)
+        return max(self.crossed(of, micro) for of in self.slow_sides)
 
     @property
     def slow_sides(self) -> IntArray:
         """The sides of slow processes, at least of the slowest."""
         return self.sides[: max(1, int((self.times > _SLOW_LAGS * self.lag).sum()))]
 
-    def _crossed(self, of: IntArray, micro: list[IntArray]) -> int:
+    def crossed(self, of: IntArray, micro: list[IntArray]) -> int:
+        """Return how often sides `of` microstates are changed in the rarer direction, at steps of the lag."""
         ways = np.zeros(2, dtype=int)
         for m in micro:
             side = of[m[:: self.lag]]
@@ -416,6 +431,22 @@ class _Model:
             for way in (0, 1):
                 ways[way] += int(((side[:-1] == way) & (side[1:] == 1 - way)).sum())
         return int(ways.min())
+
+
+def _rare(model: _Model, micro: list[IntArray], populations: FloatArray) -> tuple[tuple[Rare, ...], bool]:
+    """Return what the slowest processes lead to that was seen a few times and has a small share, and whether the
+    slowest process that leads to more was seen often enough."""
+    rare: list[Rare] = []
+    for of in model.slow_sides if len(model.times) else ():
+        n = model.crossed(of, micro)
+        if n >= _LEAST_CROSSINGS:
+            break
+        side = int(populations[of[:-1] == 1].sum() < populations[of[:-1] == 0].sum())
+        members = np.flatnonzero((of[:-1] == side) & (populations > 0.0))
+        if n == 0 or populations[members].sum() > _RARE:
+            return tuple(rare), False
+        rare.append(Rare(tuple(members.tolist()), n))
+    return tuple(rare), True
 
 
 def _drawn_times(model: _Model, resampled: IntArray) -> FloatArray:

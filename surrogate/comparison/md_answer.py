@@ -208,7 +208,7 @@ class Answer:
             use = f"Do not use {self.whose} {shown} yet."
         else:
             use = "Use the reweighted rollout" if self.is_reweighted else "Use MD's answer"
-            use += ", except for states that no transitions connect." if self.missing else "."
+            use += ", except for states that few or no transitions connect." if self.missing else "."
             what = f"For populations and free energies of {len(weighted)} states, each to {widest:.2g} % or better"
             what += " (one standard error)" + (", and relaxation times." if self.relaxation_ps else ".")
         missing = f" Missing{' in MD' * self.is_joint}: {'; '.join(self.missing)}." if self.missing else ""
@@ -396,6 +396,9 @@ def md_answer(
             missing.append(f"not connected: part of {where} was {lost.fate} ({among})")
     if found.method == "Markov model" and not missing and found.crossings == 0 and len(found.timescales):
         missing.append("the slowest process was seen in one direction only")
+    for few in found.rare:
+        times = "once" if few.crossings == 1 else f"{few.crossings} times"
+        missing.append(f"hardly known: {_where(few.microstates, micro, named)}, seen to come and go {times}")
     ps, asked, weights = md.lag_ps, (0, 0.0), found.weights
     if factors is not None and counting is not None:
         known = np.concatenate([f[np.isfinite(f)] for f in factors])

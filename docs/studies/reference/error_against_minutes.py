@@ -5,6 +5,7 @@
     python docs/studies/reference/error_against_minutes.py runs FOLDER [--minutes 1 3 10]
     python docs/studies/reference/error_against_minutes.py rivals FOLDER [--minutes 10]
     python docs/studies/reference/error_against_minutes.py table FOLDER [-o TABLE.json] [--figure FIGURE.svg]
+        [--earlier TABLE.json]
 
 `reference` makes FOLDER/NAME/run_000.h5 and on, one batch of SIMD replicas from many starts, frames 10 ps apart, as
 long as its slowest process needs for a split R-hat below 1.05; `longer` goes on where that was too short. `runs` spends
@@ -15,6 +16,7 @@ beginning of the reference, beside the rest of it. What is there is left alone, 
 lays all beside the reference: mean Jensen-Shannon distance of torsions (50 bins), root mean square error of the
 populations of states, how many 95 % intervals of populations, and of equivalent MD time, hold, and whether the verdict
 is right or "not converged". A molecule without a reference (chignolin folds in microseconds) has its verdict alone.
+With `--earlier`, molecules that FOLDER does not hold are taken from an earlier table, and the note names them.
 """
 
 from __future__ import annotations
@@ -78,6 +80,7 @@ ENOUGH_R_HAT, HELD = 1.05, 0.95
 # MD from one start that ends before this share of the time that a budget buys is none of that budget's.
 LONG_ENOUGH = 0.9
 LONGER = "longer"
+EARLIER = "earlier"
 # A rollout is no longer: what it is off by then is the model's.
 ROLLED_MINUTES = 1.0
 
@@ -345,7 +348,8 @@ def row(name: str, minutes: float, place: Path, ref: LongMD | None) -> dict[str,
     result = RunResult.of(place / f"{minutes:g}min")
     answer = answer_again(result, ref)
     told = answer.to_dict() if answer else {}
-    converged = answer is not None and answer.holds and not answer.missing
+    # What is said to be used, but for what is named.
+    converged = answer is not None and answer.is_sure and not (answer.is_joint and answer.missing)
     line: dict[str, Any] = {
         "molecule": name, "minutes": minutes, "way": result["decision"]["way"],
         "populations by": told.get("populations_by", ""),
@@ -402,10 +406,16 @@ def finished(place: Path) -> list[Path]:
     return [p for p in sorted(place.glob("[!.]*.h5")) if not checkpoint_path(p).exists()]
 
 
-def make_table(folder: Path, names: Sequence[str], out: Path | None, figure: Path | None) -> None:
+def make_table(
+    folder: Path, names: Sequence[str], out: Path | None, figure: Path | None, earlier: Path | None
+) -> None:
     """Lay all runs beside the references, print and write the table and the figure."""
-    rows = []
+    rows: list[dict[str, Any]] = []
+    before = [] if earlier is None else [earlier_row(c) for c in json.loads(earlier.read_text("utf-8"))["rows"]]
     for name in names:
+        if not budgets(folder / name):
+            rows += [r for r in before if r["molecule"] == name]
+            continue
         files = finished(folder / name)
         ref = LongMD.of(files) if files else None
         if ref is not None:
@@ -461,6 +471,24 @@ def cells(r: dict[str, Any]) -> list[str]:
     ]  # fmt: skip
 
 
+def earlier_row(told: list[str]) -> dict[str, Any]:
+    """Return what a line of an earlier table tells: all but the equivalent MD time."""
+    name, minutes = told[0].split(", ")
+    line: dict[str, Any] = {
+        "molecule": name, "minutes": float(minutes), "stated": float(told[6]) if told[6] else None,
+        "populations by": told[7], "verdict": told[9], "equivalent MD time held": None, EARLIER: True,
+    }  # fmt: skip
+    if told[1] != "none":
+        line |= dict(zip(("R-hat", HALVES), map(float, told[1].split(", ")), strict=True))
+    for way, cell in zip(WAYS, told[2:6], strict=True):
+        if cell:
+            words = (f"{way}: distance", f"{way}: populations")
+            line |= dict(zip(words, map(float, cell.split("; ")), strict=True))
+    if told[8]:
+        line |= dict(zip(("intervals held", "of"), map(int, told[8].split(" of ")), strict=True))
+    return line
+
+
 def summary(rows: list[dict[str, Any]]) -> list[str]:
     """Return the study's answers, a line each."""
     found = []
@@ -483,6 +511,8 @@ def summary(rows: list[dict[str, Any]]) -> list[str]:
     found.append(f"intervals of populations that hold, of converged answers: {held} of {total}")
     equivalent_times = [r["equivalent MD time held"] for r in sure if r["equivalent MD time held"] is not None]
     found.append(f"intervals of equivalent MD time that hold: {sum(equivalent_times)} of {len(equivalent_times)}")
+    if before := dict.fromkeys(r["molecule"] for r in rows if EARLIER in r):
+        found.append("of an earlier table: " + ", ".join(before))
     return found
 
 
@@ -533,6 +563,7 @@ def main() -> None:
     parts["rivals"].add_argument("--minutes", type=float, default=10.0)
     parts["table"].add_argument("-o", "--out", type=Path)
     parts["table"].add_argument("--figure", type=Path)
+    parts["table"].add_argument("--earlier", type=Path)
     given = parser.parse_args()
     if given.verb == "reference":
         make_reference(given.folder, given.molecules, given.time, given.every)
@@ -543,7 +574,7 @@ def main() -> None:
     elif given.verb == "rivals":
         make_rivals(given.folder, given.molecules, given.minutes)
     else:
-        make_table(given.folder, given.molecules, given.out, given.figure)
+        make_table(given.folder, given.molecules, given.out, given.figure, given.earlier)
 
 
 if __name__ == "__main__":

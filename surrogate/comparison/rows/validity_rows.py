@@ -128,12 +128,14 @@ def _share_row(inputs: ComparisonInput, check: Check, key: str) -> Row:
 
 
 def frame_keys(features: Features, k: int = 0) -> npt.NDArray[np.void] | None:
-    """Return a number per frame `(n,)` that copies share, whatever was rotated, shifted or converted in between: a few
-    angles on a grid of 0.06°; None where there are fewer than three. NaN frames are no copies of each other, nor
-    of those of trajectories of another `k`."""
-    families = [features.series[f] for f in ("angles", "torsions")] if features.series else []
-    columns = [np.concatenate(list(v)) for v in (features.phi, features.psi, *families)]
-    every = np.concatenate(columns, axis=1)
+    """Return a number per frame `(n,)` that copies share, whatever was rotated, shifted or converted in between, or
+    whichever of equal hydrogens was called the first: a few torsions on a grid of 0.06°, bond angles as well where
+    there are fewer than three; None where there are too few of both. NaN frames are no copies of each other, nor of
+    those of trajectories of another `k`."""
+    torsions, angles = (features.series[f] for f in ("torsions", "angles")) if features.series else ((), ())
+    every = np.concatenate([np.concatenate(list(v)) for v in (features.phi, features.psi, torsions) if v], axis=1)
+    if every.shape[1] < 3 and angles:
+        every = np.concatenate([every, np.concatenate(list(angles))], axis=1)
     if every.shape[1] < 3:
         return None
     chosen = np.unique(np.linspace(0, every.shape[1] - 1, _KEY_COLUMNS).astype(int))

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from surrogate.comparison import markov
-from surrogate.comparison.markov import equilibrium, reversible, with_images
+from surrogate.comparison.markov import Equilibrium, equilibrium, reversible, with_images
 from systems.errors import InputError
 
 # Three states in a row, of populations .6, .3 and .1; a jump in some 200 frames.
@@ -54,6 +54,28 @@ def test_errors_hold_as_often_as_they_say() -> None:
         found = equilibrium(run(chain(), [0, 1, 2, 2] * 8, 300, seed), seed=seed)
         inside += (np.abs(found.populations - POPULATIONS) < 2.0 * found.draws.std(0)).tolist()
     assert np.mean(inside) > 0.85
+
+
+def hardly_crossed(rare: float, seed: int) -> Equilibrium:
+    """Of the third state, in which two of sixteen replicas begin, some three ways out and back in all."""
+    populations = np.array([0.6, 0.4 - rare, rare])
+    matrix = chain(populations, 0.03)
+    flux = 3.0 / (16 * 1000)
+    for i, j in ((1, 2), (2, 1)):
+        matrix[i, i] += matrix[i, j] - flux / populations[i]
+        matrix[i, j] = flux / populations[i]
+    return equilibrium(run(matrix, [0] * 8 + [1] * 6 + [2] * 2, 1000, seed), seed=seed)
+
+
+def test_few_crossings_leave_open_what_they_lead_to_and_not_all_else() -> None:
+    found = [f for f in (hardly_crossed(0.02, seed) for seed in range(20)) if f.rare and f.rare[0].crossings < 4]
+    assert len(found) > 5 and all(f.holds and set(f.rare[0].microstates) == {2} for f in found)
+    off = [np.abs(f.populations - np.array([0.6, 0.38, 0.02])) / f.draws.std(0) for f in found]
+    assert np.mean(np.array(off) < 2.0, axis=0).min() > 0.85
+    assert all(0.4 < f.draws[:, 2].std() / f.populations[2] for f in found), "known to a factor"
+    # The negative control: where they lead to much they leave open all.
+    open_ = [f for f in (hardly_crossed(0.3, seed) for seed in range(20)) if 0 < f.crossings < 5]
+    assert len(open_) > 5 and not any(f.holds or f.rare for f in open_)
 
 
 def test_averages_count_where_transitions_are_few_and_only_there(monkeypatch: pytest.MonkeyPatch) -> None:

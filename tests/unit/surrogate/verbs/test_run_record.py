@@ -184,7 +184,8 @@ def test_an_answer_that_does_not_hold_is_not_to_be_used() -> None:
     assert few.in_short[0] == "Do not use MD's frames yet." and few.in_short[1].startswith("No torsion has two states.")
     part = told("rollout", None, answer=answer(missing=("ALA 2 left-handed: not connected",)))
     assert (
-        "except for states that no transitions connect" in part.in_short[0] and "ALA 2 left-handed" in part.in_short[1]
+        "except for states that few or no transitions connect" in part.in_short[0]
+        and "ALA 2 left-handed" in part.in_short[1]
     )
     assert told("rollout", None).in_short == ("Use it.", "Right: all.", "Why: so."), "no torsion turns"
 
