@@ -406,9 +406,7 @@ def finished(place: Path) -> list[Path]:
     return [p for p in sorted(place.glob("[!.]*.h5")) if not checkpoint_path(p).exists()]
 
 
-def make_table(
-    folder: Path, names: Sequence[str], out: Path | None, figure: Path | None, earlier: Path | None
-) -> None:
+def make_table(folder: Path, names: Sequence[str], out: Path | None, figure: Path | None, earlier: Path | None) -> None:
     """Lay all runs beside the references, print and write the table and the figure."""
     rows: list[dict[str, Any]] = []
     before = [] if earlier is None else [earlier_row(c) for c in json.loads(earlier.read_text("utf-8"))["rows"]]

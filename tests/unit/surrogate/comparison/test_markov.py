@@ -72,7 +72,7 @@ def test_few_crossings_leave_open_what_they_lead_to_and_not_all_else() -> None:
     assert len(found) > 5 and all(f.holds and set(f.rare[0].microstates) == {2} for f in found)
     off = [np.abs(f.populations - np.array([0.6, 0.38, 0.02])) / f.draws.std(0) for f in found]
     assert np.mean(np.array(off) < 2.0, axis=0).min() > 0.85
-    assert all(0.4 < f.draws[:, 2].std() / f.populations[2] for f in found), "known to a factor"
+    assert all(f.draws[:, 2].std() / f.populations[2] > 0.4 for f in found), "known to a factor"
     # The negative control: where they lead to much they leave open all.
     open_ = [f for f in (hardly_crossed(0.3, seed) for seed in range(20)) if 0 < f.crossings < 5]
     assert len(open_) > 5 and not any(f.holds or f.rare for f in open_)
