@@ -494,12 +494,14 @@ def summary(rows: list[dict[str, Any]]) -> list[str]:
     full = [r for r in sure if "one: distance" in r]
     if full:
         ratios = {w: [r[f"run: {w}"] / r[f"one: {w}"] for r in full] for w in ("populations", "distance")}
+        squares = {w: math.sqrt(np.mean([r[f"{w}: populations"] ** 2 for r in full])) for w in ("run", "one")}
         best = [min(r[f"{w}: populations"] for w in WAYS if f"{w}: populations" in r) for r in full]
         near = [r["run: populations"] <= b + (r["stated"] or 0.0) for r, b in zip(full, best, strict=True)]
         found += [
             f"with a reference of split R-hat below {ENOUGH_R_HAT}, error of the run over that of MD from one start: "
             + ", ".join(f"{word} {np.median(ratio):.2f}" for word, ratio in ratios.items())
-            + f" in the median of {len(full)}",
+            + f" in the median of {len(full)}; root mean square error of populations of all: "
+            + ", ".join(f"{WAYS[way]} {value:.2g} %" for way, value in squares.items()),
             f"populations no worse than the best way's by more than the stated error: {sum(near)} of {len(full)}",
         ]
     for word in ("right", "not converged", "wrong"):
