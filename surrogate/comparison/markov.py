@@ -63,7 +63,7 @@ class Unconnected(NamedTuple):
 
 
 class Rare(NamedTuple):
-    """States of a small share: which microstates, and how often MD was seen to come and go, in the rarer direction."""
+    """States of a small share: which microstates, and how often MD entered or left them, in the rarer direction."""
 
     microstates: tuple[int, ...]
     crossings: int
@@ -80,7 +80,7 @@ class Equilibrium:
     outside the connected set; `draws` `(n_draws, n_micro)` of a bootstrap over replicas, whose multiplicities are
     `resampled` `(n_draws, n_units)`; `unit_of` says for each unit which replica and which frames it is. `weights`: of
     every frame, one array a replica, mean 1 over all. `unconnected`: what has no weight; `rare`: what has little and
-    was seen to come and go a few times, slower than all else; `seen`: whether what is as slow and not rare was seen
+    was entered and left a few times, more slowly than all else; `seen`: whether what is as slow and not rare was seen
     often enough. `n_own`: how many replicas are MD; those behind are images of them.
     """
 
@@ -298,7 +298,7 @@ def _averaged(found: Equilibrium, micro: list[IntArray], left_out: int) -> Equil
     draws = found.resampled @ counts
     draws /= np.maximum(draws.sum(1, keepdims=True), 1.0)
     total = counts.sum(0)
-    averaged = replace(found, method="plain averages", populations=total / total.sum(), draws=draws)
+    averaged = replace(found, method="plain averages", populations=total / total.sum(), draws=draws, rare=())
     return replace(averaged, weights=with_mean_one(weights))
 
 

@@ -398,7 +398,7 @@ def md_answer(
         missing.append("the slowest process was seen in one direction only")
     for few in found.rare:
         times = "once" if few.crossings == 1 else f"{few.crossings} times"
-        missing.append(f"hardly known: {_where(few.microstates, micro, named)}, seen to come and go {times}")
+        missing.append(f"hardly known: {_where(few.microstates, micro, named)}, entered and left {times}")
     ps, asked, weights = md.lag_ps, (0, 0.0), found.weights
     if factors is not None and counting is not None:
         known = np.concatenate([f[np.isfinite(f)] for f in factors])

@@ -431,7 +431,8 @@ def make_table(folder: Path, names: Sequence[str], out: Path | None, figure: Pat
 def write_table(rows: list[dict[str, Any]], out: Path | None, figure: Path | None) -> None:
     """Print what rows come to, and write the table and the figure."""
     table = {
-        "command": "python docs/studies/reference/error_against_minutes.py table FOLDER",
+        "command": "python docs/studies/reference/error_against_minutes.py table FOLDER"
+        + " --earlier TABLE" * any(EARLIER in r for r in rows),
         "machine": f"{machine_name()}, one core used",
         "note": "Of each way the mean Jensen-Shannon distance of torsions (root, natural logarithm, 50 bins) from long "
         "SIMD MD from many starts, whose halves are so far apart, and the root mean square error of the populations of "

@@ -78,6 +78,14 @@ def test_few_crossings_leave_open_what_they_lead_to_and_not_all_else() -> None:
     assert len(open_) > 5 and not any(f.holds or f.rare for f in open_)
 
 
+def test_plain_averages_name_nothing_as_hardly_known() -> None:
+    """Of a state that is short-lived and rarely entered, by replicas that outlast it many times."""
+    matrix = np.array([[0.97, 0.03, 0.0], [0.03, 0.96995, 0.00005], [0.0, 0.01, 0.99]])
+    found = [equilibrium(run(matrix, [0, 1] * 8, 3000, seed), seed=seed) for seed in range(6)]
+    averaged = [f for f in found if f.method == "plain averages" and f.crossings < 5]
+    assert averaged and all(f.holds and not f.rare for f in averaged)
+
+
 def test_averages_count_where_transitions_are_few_and_only_there(monkeypatch: pytest.MonkeyPatch) -> None:
     """Replicas that begin in nearly the right proportions and hardly ever change state."""
     starts = np.repeat([0, 1, 2], [18, 10, 4]).tolist()

@@ -122,11 +122,11 @@ def test_a_state_that_no_md_leaves_is_missing_not_invented(forms: np.ndarray) ->
     assert sum(float(w.sum()) for w in answer.weights) == pytest.approx(32 * 300)
 
 
-def test_a_rare_state_that_md_hardly_saw_come_and_go_is_named_and_the_others_are_told(forms: np.ndarray) -> None:
+def test_a_rare_state_that_md_hardly_visited_is_named_and_the_others_are_given(forms: np.ndarray) -> None:
     matrix = np.array([[0.98, 0.02, 0.0], [0.03, 0.9695, 0.0005], [0.0, 0.008, 0.992]])
     answer = md_answer(ensemble(forms, jumps(matrix, [0, 1] * 8 + [2], 1000, 8)), 300.0)
     assert len(answer.missing) == 1 and answer.is_sure
-    assert answer.missing[0].startswith("hardly known: ALA 2 left-handed, seen to come and go ")
+    assert answer.missing[0].startswith("hardly known: ALA 2 left-handed, entered and left ")
     assert answer.in_short[0] == "Use MD's answer, except for states that few or no transitions connect."
     left = next(s for s in answer.states if s.state == "left-handed")
     assert left.error > 0.4 * left.share and max(s.error for s in answer.states) < 0.1
