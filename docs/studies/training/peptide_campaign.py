@@ -4,11 +4,12 @@
     python docs/studies/training/peptide_campaign.py FOLDER --list [--solvent obc2]
 
 ff14SB, 300 K, 4 fs. Each batch is sixteen runs `FOLDER/{test,train,fine}/NAME/run_000.h5`, ... that begin in other
-states: sixteen replicas in OBC2, 200 ps at 500 K and 500 ps at 300 K. In water (NVT at the volume of 1 bar, PME, frames
+states: sixteen replicas in OBC2, 100 ps at 500 K and 100 ps at 300 K. In water (NVT at the volume of 1 bar, PME, frames
 1 ps apart without water) the replicas are turned to the torsions of these; in OBC2 (the wide campaign, frames 5 ps
-apart) they go on from them, those of `fine` 300 ps long and frames 1 ps apart. 50 ps after that are left out. The test
-set first, then what is trained on; in water in rounds, the first of which has the monomers and every residue once at
-either place of a pair. What is there is left alone and what was stopped goes on.
+apart) they go on from them, those of `fine` 300 ps long and frames 1 ps apart. 50 ps after that are left out. What is
+tested by first, then what is trained on; in OBC2 the further half of the tests last, in water in rounds, the first of
+which has the monomers and every residue once at either place of a pair. What is there is left alone and what was
+stopped goes on.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from peptide_list import RESIDUES, Peptide, training_peptides, unseen_peptides, wide_peptides
+from peptide_list import FIRST_TESTS, RESIDUES, Peptide, training_peptides, unseen_peptides, wide_peptides
 from processes import arguments_of, in_order, only_here, parts_of, run_path, simulate_runs
 
 from md_reference.forces.forcefield import build_system
@@ -50,7 +51,7 @@ TEST, FURTHER_TEST = (
 TRAINING_PS, ROUNDS, DISCARDED_PS = 500.0, 12, 50.0
 SAVED_PS = {"tip3p": 1.0, "obc2": 5.0}
 FINE_PS, FINE_SAVED_PS = 300.0, 1.0
-HOT_K, HOT_PS, COOL_PS = 500.0, 200.0, 500.0
+HOT_K, HOT_PS, COOL_PS = 500.0, 100.0, 100.0
 TURNED_PS, STIFFNESS_KJ_MOL = 20.0, 300.0
 
 
@@ -124,7 +125,9 @@ def order(solvent: str) -> list[tuple[str, Peptide, int]]:
     """Return every batch: where its files go, the molecule and the number."""
     if solvent == IMPLICIT.solvent:
         fine = [replace(p, time_ps=FINE_PS) for p in training_peptides()[: 2 * len(RESIDUES)]]
-        kinds = (("test", unseen_peptides()), ("fine", fine), ("train", wide_peptides()))
+        tests, train = unseen_peptides(), wide_peptides()
+        kinds = (("test", tests[:FIRST_TESTS]), ("train", train[: len(RESIDUES)]), ("fine", fine),
+                 ("train", train[len(RESIDUES) :]), ("test", tests[FIRST_TESTS:]))  # fmt: skip
         return [(kind, p, 0) for kind, some in kinds for p in some]
     training = [replace(p, time_ps=TRAINING_PS) for p in training_peptides()]
     first = training[: 2 * len(RESIDUES)]

@@ -34,7 +34,8 @@ UNSEEN_CHAINS = (
 )  # fmt: skip
 UNSEEN_FREE = (("GLY", "VAL"), ("ALA", "TYR"))
 _UNSEEN_TETRAPEPTIDES = 11
-_WIDE_PAIRS, _WIDE_CHAINS, _WIDE_SEED = 300, 200, 43
+FIRST_TESTS = 17
+_WIDE_PAIRS, _WIDE_CHAINS, _WIDE_SEED, _WIDE_PS = 300, 200, 43, 2000.0
 _TEST_STARTS = 16
 _PAIR_ROUNDS = 3
 _CHAINS = 12
@@ -105,29 +106,33 @@ def unseen_tetrapeptides() -> list[tuple[str, ...]]:
 def wide_peptides() -> tuple[Peptide, ...]:
     """Return the molecules of the wide campaign, by which states of torsions may be coupled along the chain: monomers,
     then by turns pairs and chains of three to five residues, a third of these with free ends, so that any beginning is
-    a fair part; sixteen runs of 3 ns each."""
+    a fair part; sixteen runs of 2 ns each."""
     rng = random.Random(_WIDE_SEED)
     tested = {*TEST_PAIRS, *UNSEEN_PAIRS, *TEST_CHAINS, *UNSEEN_CHAINS, *TEST_FREE_CHAINS, *UNSEEN_FREE}
     tested |= {*unseen_tetrapeptides()}
     pairs = rng.sample([pair for pair in product(RESIDUES, repeat=2) if pair not in tested], _WIDE_PAIRS)
     chains = _chains(rng, tested, lengths=(3, 4, 5), n=_WIDE_CHAINS)
-    capped = [Peptide(p, True, _TEST_STARTS, 3000.0) for p in (*((r,) for r in RESIDUES), *pairs)]
+    capped = [Peptide(p, True, _TEST_STARTS, _WIDE_PS) for p in (*((r,) for r in RESIDUES), *pairs)]
     monomers, capped = capped[: len(RESIDUES)], capped[len(RESIDUES) :]
-    longer = [Peptide(p, k // 3 % 3 != 0, _TEST_STARTS, 3000.0) for k, p in enumerate(chains)]
+    longer = [Peptide(p, k // 3 % 3 != 0, _TEST_STARTS, _WIDE_PS) for k, p in enumerate(chains)]
     by_turns = sorted(((k + 0.5) / len(some), p.name, p) for some in (capped, longer) for k, p in enumerate(some))
     return (*monomers, *(p for *_, p in by_turns))
 
 
 def unseen_peptides() -> tuple[Peptide, ...]:
-    """Return what the wide campaign tests by: 12 pairs, 4 monomers, 12 capped and 14 free chains."""
+    """Return what the wide campaign tests by: 12 pairs, 4 monomers, 12 capped and 14 free chains, the first FIRST_TESTS
+    a part of each but monomers."""
     pairs, capped = (*TEST_PAIRS, *UNSEEN_PAIRS), (*TEST_CHAINS, *UNSEEN_CHAINS)
     free = (*UNSEEN_FREE, TEST_FREE_CHAINS[0], *unseen_tetrapeptides())
-    return (
+    some = (
         *(Peptide(pair, True, _TEST_STARTS, 20_000.0) for pair in pairs),
         *(Peptide((residue,), True, _TEST_STARTS, 20_000.0) for residue in (*TEST_MONOMERS, "TYR")),
         *(Peptide(chain, True, _TEST_STARTS, 10_000.0) for chain in capped),
         *(Peptide(chain, False, _TEST_STARTS, 10_000.0) for chain in free),
     )
+    first = (*pairs[:9], *capped[:3], *free[:5])
+    assert len(first) == FIRST_TESTS
+    return tuple(sorted(some, key=lambda peptide: peptide.residues not in first))
 
 
 def _matching(rng: random.Random, taken: set[tuple[str, str]]) -> list[tuple[str, str]]:
