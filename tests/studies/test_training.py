@@ -158,15 +158,29 @@ def processes(memory: float, shift: float, seed: int) -> list[np.ndarray]:
     return list(shift + 0.6 * x)
 
 
+def all_count(runs: list[np.ndarray]) -> list[np.ndarray]:
+    return [np.ones(len(x)) for x in runs]
+
+
 def test_distances_over_those_of_md_itself_tell_what_is_off() -> None:
     md, like, off = processes(0.9, 0.0, 1), processes(0.9, 0.0, 2), processes(0.9, 0.1, 3)
     for measure in (peptide_unseen.single, peptide_unseen.pooled):
-        same, shifted = (
-            peptide_unseen.over(measure, peptide_unseen.densities(md), peptide_unseen.densities(x)) for x in (like, off)
-        )
+        own, *others = (peptide_unseen.densities(x, all_count(x)) for x in (md, like, off))
+        same, shifted = (peptide_unseen.over(measure, own, x) for x in others)
         assert same == pytest.approx(1.0, abs=0.1) and shifted > 1.3
-    joint, halves = ([peptide_unseen.joint_densities(x, [(0, 1)])[0] for x in some] for some in ([[md[0]]], [[off[0]]]))
-    assert joint[0].shape == halves[0].shape == (1, 36 * 36) and joint[0].sum() == 4000
+    (joint,) = peptide_unseen.joint_densities(md[:1], all_count(md[:1]), [(0, 1)])
+    assert joint.shape == (1, 36 * 36) and joint.sum() == 4000
+
+
+def test_a_rare_positive_phi_plays_no_part() -> None:
+    md = [0.3 * x - 1.5 for x in processes(0.9, 0.0, 1)]
+    md[0][:1000, 0] = 1.0
+    (first, *others) = peptide_unseen.shown(md, [0])
+    assert first[:1000].all() and not first[1000:].any() and not np.concatenate(others).any()
+    assert len(peptide_unseen.never(md, [0])) == 7 and len(peptide_unseen.never(md, [])) == 8
+    for x in md[:5]:
+        x[:10, 0] = 1.0
+    assert len(peptide_unseen.never(md, [0])) == 8, "too few are without"
 
 
 def test_kinetics_and_lags_are_over_those_of_md() -> None:

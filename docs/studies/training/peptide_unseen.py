@@ -9,6 +9,9 @@ bins) over φ, ψ and χ, of one run to all others' MD (single), and of half of 
 that of MD itself; joint maps of ψ and the next φ (36 x 36) pooled. Kinetics: integrated correlation times of every cos
 ψ and along the two slowest TICA coordinates of MD, over MD's; of MD's halves beside it. Lags: root mean square
 difference of the populations of torsion states at 100 ps and 1 ns from those at 10 ps, over what MD's halves differ.
+A φ > 0 that MD enters fewer than ten times plays no part: frames that show it are left out of distances, runs that do
+out of kinetics (what its population is, `peptide_energies` and `peptide_gates seeds` say). Free chains of four, by
+MDGen's recipe: every other run of the model and of MD to the remaining runs of MD, and the first over the second.
 `--corrected`: rollouts in one solvent (HERE) weighed and stretched as runs of monomers in another say
 (`peptide_correction`). What is there is read.
 """
@@ -27,15 +30,20 @@ import numpy as np
 import numpy.typing as npt
 from peptide_correction import Correction
 from peptide_rollouts import FRAMES_PS, rolled, thinned
-from peptide_scores import angles, turns_of
+from peptide_scores import angles, rarely_positive, turns_of
 
 from surrogate.comparison.measure.distributions import distance
 from surrogate.comparison.measure.kinetics import circular_features, fit_projection, tica_lag, zero_crossing
+from surrogate.comparison.measure.structure import Baseline
 from surrogate.comparison.measure.torsions import find_wells
+from surrogate.comparison.read.ensemble import Ensemble
+from surrogate.comparison.rows.published_metrics import TABLE, fit_recipe, peptide_table
 from surrogate.models.architecture import weights_path
+from surrogate.models.peptides.chains import POSITIVE_PHI_DEG
 from surrogate.models.weights import Weights, load_weights
 from surrogate.sampling.domain import fit_weights
 from systems.chemistry.validity import INVALID, Geometry, check_frames
+from systems.scene import Scene
 
 FloatArray = npt.NDArray[np.float64]
 # Runs of torsions in rad, `(n_frames, n_torsions)` each.
@@ -43,20 +51,18 @@ Runs = Sequence[FloatArray]
 RUN_PS, LAGS_PS, BINS, JOINT_BINS, HALVES, SEED = 10_000.0, (100.0, 1000.0), 50, 36, 10, 0
 
 
-def densities(runs: Runs, weights: Runs | None = None) -> list[FloatArray]:
-    """Return of each run the histograms of every torsion, `(n_torsions, BINS)`."""
+def densities(runs: Runs, weights: Runs) -> list[FloatArray]:
+    """Return of each run, whose frames count `weights`, the histograms of every torsion, `(n_torsions, BINS)`."""
     edges = np.linspace(-math.pi, math.pi, BINS + 1)
     return [np.stack([np.histogram(x, edges, weights=w)[0] for x in run.T]).astype(np.float64)
-            for run, w in zip(runs, weights or [None] * len(runs), strict=True)]  # fmt: skip
+            for run, w in zip(runs, weights, strict=True)]  # fmt: skip
 
 
-def joint_densities(
-    runs: Runs, pairs: Sequence[tuple[int, int]], weights: Runs | None = None
-) -> list[FloatArray]:  # fmt: skip
+def joint_densities(runs: Runs, weights: Runs, pairs: Sequence[tuple[int, int]]) -> list[FloatArray]:
     """Return of each run the joint histograms of pairs of torsions, `(n_pairs, JOINT_BINS ** 2)`."""
     edges = np.linspace(-math.pi, math.pi, JOINT_BINS + 1)
     return [np.stack([np.histogram2d(run[:, i], run[:, j], (edges, edges), weights=w)[0].ravel() for i, j in pairs])
-            for run, w in zip(runs, weights or [None] * len(runs), strict=True)]  # fmt: skip
+            for run, w in zip(runs, weights, strict=True)]  # fmt: skip
 
 
 def mean_distance(one: FloatArray, other: FloatArray) -> float:
@@ -84,6 +90,36 @@ def over(measure: Callable[..., FloatArray], md: Sequence[FloatArray], of: Seque
     return float(measure(md, of).mean() / measure(md, md).mean())
 
 
+def shown(runs: Runs, rare: Sequence[int]) -> list[npt.NDArray[np.bool_]]:
+    """Return in which frames of each run a φ of columns `rare` is positive."""
+    low, high = np.radians(POSITIVE_PHI_DEG)
+    return [((x[:, rare] > low) & (x[:, rare] < high)).any(axis=1) for x in runs]
+
+
+def never(runs: Runs, rare: Sequence[int]) -> Runs:
+    """Return the runs without a positive φ of columns `rare`; all of them where few are without."""
+    found = [x for x, there in zip(runs, shown(runs, rare), strict=True) if not there.any()]
+    return found if 2 * len(found) >= len(runs) else runs
+
+
+def published(scene: Scene, md_nm: Runs, own_nm: Runs) -> dict[str, list[float]] | None:
+    """Return the columns of MDGen's table, the model's distance, the replicate's and their ratio; None where it has no
+    Markov model."""
+
+    def frames(some: Runs) -> Ensemble:
+        segments = [x.astype(np.float32) for x in some]
+        return Ensemble(scene.name, segments, FRAMES_PS, scene)
+
+    reference, replicate, own = frames(md_nm[::2]), frames(md_nm[1::2]), frames(own_nm[1::2])
+    baseline = Baseline.of(reference)
+    of = [baseline.measure(x) for x in (reference, replicate, own)]
+    fit = fit_recipe(of[0])
+    if fit is None:
+        return None
+    floor, model = (peptide_table(fit, of[0], x).tolist() for x in of[1:])
+    return {name: [b, a, b / a] for name, a, b in zip(TABLE, floor, model, strict=True)}
+
+
 def correlation_times_ps(series: Sequence[FloatArray]) -> FloatArray:
     """Return the integrated correlation time of each column of runs `(n_frames, k)`."""
     return FRAMES_PS * np.array([zero_crossing([x[:, k] for x in series])[1] for k in range(series[0].shape[1])])
@@ -91,12 +127,15 @@ def correlation_times_ps(series: Sequence[FloatArray]) -> FloatArray:
 
 def kinetics(md: Runs, of: Runs, psi: Sequence[int]) -> dict[str, float]:
     """Return by torsion number of ψ, and for the slowest coordinates, correlation times of `of` over MD's."""
-    columns = {f"ψ {k}": ([np.cos(x[:, [k]]) for x in md], [np.cos(x[:, [k]]) for x in of]) for k in psi}
+    columns: dict[str, tuple[Runs, Runs]] = {
+        f"ψ {k}": ([np.cos(x[:, [k]]) for x in md], [np.cos(x[:, [k]]) for x in of]) for k in psi
+    }
     features = [[circular_features(x) for x in some] for some in (md, of)]
     slow = fit_projection(features[0], tica_lag(FRAMES_PS), 2)
     if slow is not None:
+        ours, theirs = ([slow.project(x) for x in some] for some in features)
         for k in range(slow.matrix.shape[1]):
-            columns[f"TICA {k}"] = tuple([slow.project(x)[:, [k]] for x in some] for some in features)
+            columns[f"TICA {k}"] = [x[:, [k]] for x in ours], [x[:, [k]] for x in theirs]
     ratios = {name: correlation_times_ps(b) / correlation_times_ps(a) for name, (a, b) in columns.items()}
     return {name: float(ratio[0]) for name, ratio in ratios.items()}
 
@@ -139,23 +178,29 @@ def molecule(
              for some in (md_nm, own_nm)]  # fmt: skip
     turns = turns_of(scene)
     md, of = ([angles(turns, x) for x in some] for some in (md_nm, own_nm))
+    rare = rarely_positive(turns, md)
+    counted = [[(~x).astype(np.float64) for x in shown(some, rare)] for some in (md, of)]
     at = {(t.kind, t.residue): k for k, t in enumerate(turns)}
     psi = [k for k, t in enumerate(turns) if t.kind == "psi"]
     pairs = [(k, at["phi", t.residue + 1]) for k, t in enumerate(turns)
              if t.kind == "psi" and ("phi", t.residue + 1) in at]  # fmt: skip
     amino_acids = [name for name in scene.residue_names if name not in ("ACE", "NME")]
-    shares = None if correction is None else [correction.weights(turns, amino_acids, x) for x in of]
-    one = densities(md), densities(of, shares)
-    joint = (joint_densities(md, pairs), joint_densities(of, pairs, shares)) if pairs else None
+    if correction is not None:
+        counted[1] = [a * correction.weights(turns, amino_acids, x) for a, x in zip(counted[1], of, strict=True)]
+    one = densities(md, counted[0]), densities(of, counted[1])
+    joint = (joint_densities(md, counted[0], pairs), joint_densities(of, counted[1], pairs)) if pairs else None
     clock = 1.0 if correction is None else correction.clock
+    usual = never(md, rare)
     return {
         "frames": sum(map(len, md)),
         "torsions, single": over(single, *one),
         "torsions, pooled": over(pooled, *one),
         "joint maps, pooled": None if joint is None else over(pooled, *joint),
-        "MD's own, single": float(single(densities(md), densities(md)).mean()),
-        "kinetics": {name: clock * ratio for name, ratio in kinetics(md, of, psi).items()},
-        "kinetics of MD's halves": kinetics(md[: len(md) // 2], md[len(md) // 2 :], psi),
+        "MD's own, single": float(single(one[0], one[0]).mean()),
+        "rare φ > 0": [f"{turns[k].kind} {turns[k].residue}" for k in rare],
+        "kinetics": {name: clock * ratio for name, ratio in kinetics(usual, never(of, rare), psi).items()},
+        "kinetics of MD's halves": kinetics(usual[::2], usual[1::2], psi),
+        "MDGen's recipe": published(scene, md_nm, own_nm) if len(psi) == 3 and len(amino_acids) == 4 else None,
         "lags": lag_errors(md, of, {lag: [angles(turns, x) for x in roll(lag)] for lag in LAGS_PS}),
         "valid, %: MD, model": valid,
     }
@@ -177,6 +222,9 @@ def summary(rows: dict[str, dict[str, Any]]) -> list[str]:
         lines.append(
             f"populations at {lag:g} ps: {np.mean(found):.2f} of what MD's halves differ, at most {max(found):.2f}"
         )
+    tables = [row["MDGen's recipe"] for row in rows.values() if row["MDGen's recipe"]]
+    for column in TABLE if tables else ():
+        lines.append(f"MDGen's recipe, {column}: {np.nanmean([one[column][2] for one in tables]):.2f} of {len(tables)}")
     lines.append(f"valid: {np.mean([row['valid, %: MD, model'][1] for row in rows.values()]):.2f} %")
     return lines
 
