@@ -55,11 +55,16 @@ def test_no_test_molecule_is_trained_on() -> None:
 
 def test_no_molecule_that_tests_is_in_the_wide_campaign() -> None:
     wide, unseen = wide_peptides(), unseen_peptides()
-    assert len({p.name for p in wide}) == len(wide) == 22 + 300 + 200 and len({p.name for p in unseen}) == len(unseen)
-    assert not {p.residues for p in wide} & {p.residues for p in unseen if len(p.residues) > 1}
-    assert sum(not p.capped for p in wide) == 68 and wide_peptides() == wide
-    tenth = wide[22 : 22 + 50]
-    assert sum(len(p.residues) == 2 for p in tenth) == 30 and 4 < sum(not p.capped for p in tenth) < 10
+    tested = {p.residues for p in (*unseen, *held_out_peptides()) if len(p.residues) > 1}
+    assert len({p.name for p in wide}) == len(wide) == 22 + 300 + 200 + 66 and len({p.name for p in unseen}) == len(
+        unseen
+    )
+    assert not {p.residues for p in wide} & tested
+    assert sum(not p.capped for p in wide) == 68 + 66 and wide_peptides() == wide
+    tenth = wide[22 : 22 + 56]
+    pairs = [p for p in tenth if len(p.residues) == 2]
+    assert sum(p.capped for p in pairs) == 30 and 4 < sum(not p.capped for p in pairs) < 9
+    assert 4 < sum(not p.capped for p in tenth if len(p.residues) > 2) < 10
     assert sum(not p.capped and len(p.residues) == 4 for p in unseen) == 12
     missing = {r for p in unseen for r in p.residues} - {r for p in wide for r in p.residues}
     assert not missing

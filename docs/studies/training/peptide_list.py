@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import random
+from collections.abc import Set
 from dataclasses import dataclass
 from itertools import product
 
@@ -34,8 +35,8 @@ UNSEEN_CHAINS = (
 )  # fmt: skip
 UNSEEN_FREE = (("GLY", "VAL"), ("ALA", "TYR"))
 _UNSEEN_TETRAPEPTIDES = 11
-FIRST_TESTS = 17
-_WIDE_PAIRS, _WIDE_CHAINS, _WIDE_SEED, _WIDE_PS = 300, 200, 43, 2000.0
+FIRST_TESTS = 14
+_WIDE_PAIRS, _WIDE_CHAINS, _WIDE_FREE_ROUNDS, _WIDE_SEED, _WIDE_PS = 300, 200, 3, 43, 2000.0
 _TEST_STARTS = 16
 _PAIR_ROUNDS = 3
 _CHAINS = 12
@@ -105,17 +106,23 @@ def unseen_tetrapeptides() -> list[tuple[str, ...]]:
 
 def wide_peptides() -> tuple[Peptide, ...]:
     """Return the molecules of the wide campaign, by which states of torsions may be coupled along the chain: monomers,
-    then by turns pairs and chains of three to five residues, a third of these with free ends, so that any beginning is
-    a fair part; sixteen runs of 2 ns each."""
+    then by turns pairs, chains of three and four residues, a third of these with free ends, and pairs with free ends
+    that every residue bears, so that any beginning is a fair part; sixteen runs of 2 ns each."""
     rng = random.Random(_WIDE_SEED)
     tested = {*TEST_PAIRS, *UNSEEN_PAIRS, *TEST_CHAINS, *UNSEEN_CHAINS, *TEST_FREE_CHAINS, *UNSEEN_FREE}
     tested |= {*unseen_tetrapeptides()}
     pairs = rng.sample([pair for pair in product(RESIDUES, repeat=2) if pair not in tested], _WIDE_PAIRS)
-    chains = _chains(rng, tested, lengths=(3, 4, 5), n=_WIDE_CHAINS)
-    capped = [Peptide(p, True, _TEST_STARTS, _WIDE_PS) for p in (*((r,) for r in RESIDUES), *pairs)]
-    monomers, capped = capped[: len(RESIDUES)], capped[len(RESIDUES) :]
-    longer = [Peptide(p, k // 3 % 3 != 0, _TEST_STARTS, _WIDE_PS) for k, p in enumerate(chains)]
-    by_turns = sorted(((k + 0.5) / len(some), p.name, p) for some in (capped, longer) for k, p in enumerate(some))
+    chains = _chains(rng, tested, lengths=(3, 4), n=_WIDE_CHAINS)
+    free: list[tuple[str, str]] = []
+    for _ in range(_WIDE_FREE_ROUNDS):
+        free += _matching(rng, {*tested, *free})
+    kinds = (
+        [Peptide(p, True, _TEST_STARTS, _WIDE_PS) for p in pairs],
+        [Peptide(p, k // 3 % 3 != 0, _TEST_STARTS, _WIDE_PS) for k, p in enumerate(chains)],
+        [Peptide(p, False, _TEST_STARTS, _WIDE_PS) for p in free],
+    )
+    by_turns = sorted(((k + 0.5) / len(some), p.name, p) for some in kinds for k, p in enumerate(some))
+    monomers = [Peptide((r,), True, _TEST_STARTS, _WIDE_PS) for r in RESIDUES]
     return (*monomers, *(p for *_, p in by_turns))
 
 
@@ -130,12 +137,12 @@ def unseen_peptides() -> tuple[Peptide, ...]:
         *(Peptide(chain, True, _TEST_STARTS, 10_000.0) for chain in capped),
         *(Peptide(chain, False, _TEST_STARTS, 10_000.0) for chain in free),
     )
-    first = (*pairs[:9], *capped[:3], *free[:5])
+    first = (*pairs[:9], *capped[:2], *free[:3])
     assert len(first) == FIRST_TESTS
     return tuple(sorted(some, key=lambda peptide: peptide.residues not in first))
 
 
-def _matching(rng: random.Random, taken: set[tuple[str, str]]) -> list[tuple[str, str]]:
+def _matching(rng: random.Random, taken: Set[tuple[str, ...]]) -> list[tuple[str, str]]:
     """Return one pair for each residue at the first place, each once at the second, none of them `taken`."""
     while True:
         second = list(RESIDUES)
