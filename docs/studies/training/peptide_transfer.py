@@ -1,11 +1,12 @@
 """Train weights for peptides on runs in one solvent or several, from nothing or from others.
 
     python docs/studies/training/peptide_transfer.py OUT.safetensors --train FOLDER [FOLDER ...] --budget 1h
-                            [--start WEIGHTS] [--tuned all|states|solvent] [--coupled] [--runs 16] [--steps N]
+               [--start WEIGHTS] [--tuned all|states|solvent] [--coupled] [--runs 16] [--steps N] [--unseen 12]
 
 FOLDER: `train` in a folder of `peptide_campaign` or `peptide_runs`, of each molecule in it the first `--runs`. `states`
 trains the probabilities of torsion states alone, `solvent` what a solvent has of its own (means, scales, correlations,
-levels and two embeddings); both need `--start`. Free energies of φ > 0 are those of `peptide_energies` beside OUT, or
+levels and two embeddings); both need `--start`. `--unseen`: every so many molecules of several residues one is left
+out, and the curves show its loss. Free energies of φ > 0 are those of `peptide_energies` beside OUT, or
 those that the weights gone on from were trained with. A training that was stopped goes on.
 """
 
@@ -18,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from peptide_energies import known_energies
-from peptide_list import held_out_peptides, unseen_peptides
+from peptide_list import RESIDUES, held_out_peptides, unseen_peptides
 from processes import is_trained
 
 from surrogate.data import TrainingFrames, collect_frames
@@ -63,21 +64,28 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--tuned", choices=TUNED, default="all")
     parser.add_argument("--coupled", action="store_true")
     parser.add_argument("--runs", type=int, default=10_000)
+    parser.add_argument("--unseen", type=int, default=0)
     parser.add_argument("--budget", type=lambda text: parse_wall_s(text, "--budget"))
     parser.add_argument("--steps", type=int)
     a = parser.parse_args(arguments)
     if is_trained(a.out):
         return
     sets = sets_of(a.train, a.runs)
+    names = {id(frames): "-".join(frames.scene.residue_names) for frames in sets}
+    alone = {f"ACE-{residue}-NME" for residue in RESIDUES}
+    chains = sorted({*names.values()} - alone)
+    left = chains[:: a.unseen] if a.unseen else []
+    unseen = [frames for frames in sets if names[id(frames)] in left]
+    sets = [frames for frames in sets if names[id(frames)] not in left]
     total_us = sum(frames.total_ps for frames in sets) * 1e-6
-    sys.stdout.write(f"{len(sets)} molecules, {total_us:.3g} µs\n")
+    sys.stdout.write(f"{len(sets)} sets of runs, {total_us:.3g} µs; left out: {', '.join(left) or 'none'}\n")
     start = None if a.start is None else load_weights(weights_path(a.start))
     energies = known_energies(a.out.parent) or trained_with(None if start is None else start.provenance)
     training = PeptideTraining(
         budget_s=a.budget, steps=a.steps, time_reversal=True, positive_phi_kt=energies, tuned=a.tuned,
         validate_every_s=_VALIDATE_S,
     )  # fmt: skip
-    train_peptides(sets, a.out, PeptideConfig(coupled=a.coupled), training, start=start, resume=True)
+    train_peptides(sets, a.out, PeptideConfig(coupled=a.coupled), training, unseen=unseen, start=start, resume=True)
 
 
 if __name__ == "__main__":

@@ -82,6 +82,9 @@ class StateJumps(nn.Module):
             self.blocks = nn.ModuleList(ParallelBlock(_WIDTH, _COUPLED_HEADS) for _ in range(_COUPLED_BLOCKS))
             self.of_distance = nn.Embedding(2 * _FAR + 1, _COUPLED_HEADS)
             self.of_new_beside = nn.ModuleList(nn.Linear(n_states, _WIDTH, bias=False) for _ in range(2))
+            # Weights that are gone on from begin as they were.
+            for part in (*self.of_type_beside, *self.of_new_beside):
+                nn.init.zeros_(cast(nn.Embedding | nn.Linear, part).weight)
 
     @property
     def turns(self) -> tuple[slice, ...]:

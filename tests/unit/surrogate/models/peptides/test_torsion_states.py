@@ -449,3 +449,18 @@ def test_the_given_frame_reaches_residues_that_are_not_neighbours_where_states_a
             block.offset.fill_(1.0)
         one, two = (net.of_observed(x, states, places, counts)[0, 0] for x in (observed, other))
         assert torch.equal(one, two) != coupled
+
+
+def test_coupled_states_begin_as_the_weights_gone_on_from() -> None:
+    torch.manual_seed(0)
+    net, coupled = StateJumps(6, 4), StateJumps(6, 4, coupled=True)
+    torch.nn.init.normal_(net.logits.weight)
+    coupled.load_state_dict(net.state_dict(), strict=False)
+    places, counts = torch.tensor([[2, 0, 3], [3, 2, 2], [2, 3, 1]]), _counts([2], [2], [2])
+    states = torch.randint(2, (5, 4, 3, MOST_TORSIONS)) * (torch.arange(MOST_TORSIONS) == 0)
+    one, two = (
+        x.loss(torch.ones(5, 3, 6), states, places, counts, torch.ones(5, 3), torch.ones(5, 3)) for x in (net, coupled)
+    )
+    assert float(one) == float(two) > 0.0
+    coupled.of_type_beside[0].weight.data += 1.0
+    assert float(coupled.loss(torch.ones(5, 3, 6), states, places, counts, torch.ones(5, 3), torch.ones(5, 3))) != one
