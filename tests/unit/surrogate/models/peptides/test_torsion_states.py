@@ -456,6 +456,8 @@ def test_coupled_states_begin_as_the_weights_gone_on_from() -> None:
     net, coupled = StateJumps(6, 4), StateJumps(6, 4, coupled=True)
     torch.nn.init.normal_(net.logits.weight)
     coupled.load_state_dict(net.state_dict(), strict=False)
+    for part in (net, coupled):
+        part.requires_grad_(False)
     places, counts = torch.tensor([[2, 0, 3], [3, 2, 2], [2, 3, 1]]), _counts([2], [2], [2])
     states = torch.randint(2, (5, 4, 3, MOST_TORSIONS)) * (torch.arange(MOST_TORSIONS) == 0)
     one, two = (
