@@ -1,4 +1,4 @@
-"""Gates of the weights `peptides`, each a table: `python docs/studies/training/peptide_gates.py lag FOLDER ...`.
+"""What a model of one peptide learns, each a table: `python docs/studies/training/peptide_gates.py lag FOLDER ...`.
 
 `lag`: one model of alanine dipeptide (or any one peptide with phi and psi), trained for a number of steps on `--train`,
 is started from frames of `--test`, which it never saw. At each lag: the correlation of cos psi one lag later and the
@@ -13,12 +13,6 @@ beside what the short runs and a Markov model of them say. How likely phi > 0 is
 
 `code`: how far frames of the molecules below `--test`, coded by residues as in training and rebuilt, lie from
 themselves: heavy atoms (RMSD, Å) and torsions (degrees). The scale of the numbers is that of the monomers in `--train`.
-
-`pairs`: trained on the monomers, the first `--pairs` capped pairs, `--chains` longer ones and `--free` with free ends
-below `--train` (`train` in a folder of `peptide_runs`), the model rolls each molecule below `--test` as long and as
-often as MD did. Distances over MD's own scatter, beside the library of monomers' torsions (`peptide_scores`).
-
-`verdicts`: what `surromd compare` says of the rollouts that `pairs` left in FOLDER (`--rollouts`, a folder of it).
 
 `free-energy`: of phi > 0 of a capped residue, in kT, by two well-tempered metadynamics runs, which must agree, and by
 the runs of `--md`. What is finished in FOLDER is not done again.
@@ -40,7 +34,6 @@ import numpy.typing as npt
 from lag_errors import Row, evenly_started, hold_against, joint_distance, table, torsions
 from peptide_energies import known_energies
 from peptide_list import training_peptides
-from peptide_pairs import pairs_gate
 from peptide_rollouts import (
     FRAMES_PS,
     REPLICA_LAG_PS,
@@ -51,7 +44,6 @@ from peptide_rollouts import (
     rolled,
     thinned,
 )
-from peptide_verdicts import verdicts_gate
 
 from systems.chemistry.validity import Geometry
 from systems.units import GAS_CONSTANT_KJ_MOL_K
@@ -244,11 +236,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """Parse and run one gate."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     gates = parser.add_subparsers(dest="gate", required=True)
-    names = ("lag", "seeds", "code", "pairs", "verdicts", "free-energy")
-    lag, seeds, code, pairs, verdicts, energy = (gates.add_parser(name) for name in names)
-    for gate in (lag, seeds, code, pairs, verdicts, energy):
+    names = ("lag", "seeds", "code", "free-energy")
+    lag, seeds, code, energy = (gates.add_parser(name) for name in names)
+    for gate in (lag, seeds, code, energy):
         gate.add_argument("folder", type=Path)
-    for gate in (lag, seeds, pairs):
+    for gate in (lag, seeds):
         gate.add_argument("--steps", type=int, default=STEPS, help="optimisation steps of the training")
     lag.add_argument("--train", type=Path, nargs="+", required=True, help="references of one peptide")
     for gate in (lag, seeds):
@@ -257,24 +249,14 @@ def main(arguments: Sequence[str] | None = None) -> None:
     seeds.add_argument("--weights", type=Path, nargs="*", default=(), help="other models to roll beside it")
     lag.add_argument("--starts", type=int, default=STARTS, help="frames that each lag is started from")
     lag.add_argument("--plain", action="store_true", help="train on the coordinates themselves, not on innovations")
-    for gate in (code, pairs):
-        gate.add_argument("--train", type=Path, required=True, help="`train` in a folder of `peptide_runs`")
-    for gate in (code, pairs, verdicts):
-        gate.add_argument("--test", type=Path, required=True, help="`test` in a folder of `peptide_runs`")
-    pairs.add_argument("--budget", help="wall time of a training, in place of steps")
-    pairs.add_argument("--from", dest="start", type=Path, help="weights that the training goes on from")
-    pairs.add_argument("--pairs", type=int, nargs="+", default=(12, 24, 60), help="how many pairs to train on")
-    pairs.add_argument("--chains", type=int, default=0, help="how many chains of three and four residues, too")
-    pairs.add_argument("--free", type=int, default=0, help="how many pairs with free ends, too")
-    verdicts.add_argument("--rollouts", required=True, help="folder of rollouts in FOLDER, such as pairs-60")
+    code.add_argument("--train", type=Path, required=True, help="`train` in a folder of `peptide_runs`")
+    code.add_argument("--test", type=Path, required=True, help="`test` in a folder of `peptide_runs`")
     energy.add_argument("--sequence", default="ACE-ALA-NME")
     energy.add_argument("--time-ps", type=float, default=50_000.0, help="of each metadynamics run")
     energy.add_argument("--md", type=Path, nargs="*", default=(), help="long runs of the same molecule")
     a = parser.parse_args(arguments)
     a.folder.mkdir(parents=True, exist_ok=True)
-    gate_of = dict(
-        zip(names, (lag_gate, seeds_gate, code_gate, pairs_gate, verdicts_gate, free_energy_gate), strict=True)
-    )
+    gate_of = dict(zip(names, (lag_gate, seeds_gate, code_gate, free_energy_gate), strict=True))
     gate_of[a.gate](a)
 
 

@@ -1,27 +1,21 @@
-"""How near rollouts of a peptide come to MD of it, beside MD's own scatter and a library of monomers' torsions.
+"""Torsions of peptides for the studies, a library of monomers' torsions, and what coding by residues loses.
 
-Figures are Jensen-Shannon distances of 50 bins (36 x 36 of joint maps), means over all torsions of a peptide: phi, psi
-and chi, each folded by its symmetry. The replicate baseline is the mean over pairs of independent MD runs; a source's
-figure is the mean over each of its runs against each of MD's, of equal length and as many frames. The library draws
-each residue's torsions together from MD of its monomer ACE-X-NME, independent of the neighbours: what a model must beat
-on joint maps of neighbours, or it has learned nothing of pairs. A phi > 0 that MD enters fewer than ten times in all
-leaves the maps of all sources: how often it is visited is chance, and a matter of free energies (`peptide_gates
-seeds`).
+Torsions are phi, psi and chi, each folded by its symmetry. The library draws each residue's torsions together from MD
+of its monomer ACE-X-NME, independent of the neighbours: what a model must beat on joint maps of neighbours, or it has
+learned nothing of pairs.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import combinations
 from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
 
-from surrogate.comparison.measure.distributions import distance
 from surrogate.comparison.measure.torsions import find_torsions
-from surrogate.models.peptides.chains import NEGATIVE_CORE_DEG, POSITIVE_CORE_DEG, POSITIVE_PHI_DEG
+from surrogate.models.peptides.chains import NEGATIVE_CORE_DEG, POSITIVE_CORE_DEG
 from systems.chemistry.geometry import superpose, torsion
 from systems.chemistry.graph import backbone_torsions
 from systems.scene import Scene
@@ -30,7 +24,6 @@ if TYPE_CHECKING:
     from surrogate.models.peptides.layout import PeptideConfig
 
 FloatArray = npt.NDArray[np.float64]
-_BINS, _JOINT_BINS = 50, 36
 _LEAST_ENTRIES = 10
 
 
@@ -43,20 +36,6 @@ class Turn:
     residue: int
     quad: tuple[int, int, int, int]
     fold: int = 1
-
-
-@dataclass(frozen=True)
-class Scores:
-    """Distances of one source to MD of a peptide, with the standard error over its runs: mean over single torsions, and
-    over joint maps of psi and the next residue's phi (NaN for a monomer). `valid`: the share of its frames without
-    broken bonds, angles or clashes (NaN of what has no frames)."""
-
-    source: str
-    single: float
-    single_error: float
-    joint: float
-    joint_error: float
-    valid: float = float("nan")
 
 
 def turns_of(scene: Scene) -> list[Turn]:
@@ -105,62 +84,6 @@ def rarely_positive(turns: Sequence[Turn], reference: Sequence[FloatArray]) -> l
     """Return the places of phi in `turns` that enter the left-handed side fewer than ten times in all of MD."""
     phi = [k for k, t in enumerate(turns) if t.kind == "phi"]
     return [k for k in phi if crossings([x[:, k] for x in reference], 1.0)["entries"] < _LEAST_ENTRIES]
-
-
-def without(runs: Sequence[FloatArray], rare: Sequence[int]) -> list[FloatArray]:
-    """Return runs of torsions `(n_frames, n_turns)` without frames in which one of the phi at `rare` is on the left-
-    handed side; runs that spend half of their time there are left out."""
-    low, high = np.radians(POSITIVE_PHI_DEG)
-    kept = [x[~((x[:, rare] > low) & (x[:, rare] < high)).any(axis=1)] for x in runs]
-    return [x for x, whole in zip(kept, runs, strict=True) if len(x) >= len(whole) / 2]
-
-
-def score(turns: Sequence[Turn], reference: Sequence[FloatArray], source: Sequence[FloatArray], name: str) -> Scores:
-    """Return a source's distances to MD; `reference` and `source` are runs of torsions `(n_frames, n_turns)` of one
-    length."""
-    return _scores(turns, [(i, a, b) for i, a in enumerate(source) for b in reference], name)
-
-
-def floor(turns: Sequence[Turn], reference: Sequence[FloatArray]) -> Scores:
-    """Return the distances between independent MD runs."""
-    return _scores(turns, [(k, a, b) for k, (a, b) in enumerate(combinations(reference, 2))], "MD")
-
-
-def _scores(turns: Sequence[Turn], pairs: list[tuple[int, FloatArray, FloatArray]], name: str) -> Scores:
-    joints = [
-        (i, j)
-        for i, a in enumerate(turns)
-        for j, b in enumerate(turns)
-        if (a.kind, b.kind) == ("psi", "phi") and b.residue == a.residue + 1
-    ]
-
-    def over_pairs(measured: Callable[[FloatArray, FloatArray], float]) -> tuple[float, float]:
-        of_run: dict[int, list[float]] = {}
-        for run, a, b in pairs:
-            of_run.setdefault(run, []).append(measured(a, b))
-        means = np.array([np.mean(values) for values in of_run.values()])
-        error = float(means.std(ddof=1) / np.sqrt(len(means))) if len(means) > 1 else float("nan")
-        return float(means.mean()), error
-
-    def single(a: FloatArray, b: FloatArray) -> float:
-        return float(np.mean([_distance_1d(a[:, k], b[:, k]) for k in range(len(turns))]))
-
-    def joint(a: FloatArray, b: FloatArray) -> float:
-        return (
-            float(np.mean([_distance_2d(a[:, ij], b[:, ij]) for ij in map(list, joints)])) if joints else float("nan")
-        )
-
-    return Scores(name, *over_pairs(single), *over_pairs(joint))
-
-
-def _distance_1d(a: FloatArray, b: FloatArray) -> float:
-    edges = np.linspace(-np.pi, np.pi, _BINS + 1)
-    return float(distance(*(np.histogram(x, edges)[0].astype(np.float64) for x in (a, b))))
-
-
-def _distance_2d(a: FloatArray, b: FloatArray) -> float:
-    edges = np.linspace(-np.pi, np.pi, _JOINT_BINS + 1)
-    return float(distance(*(np.histogram2d(x[:, 0], x[:, 1], (edges, edges))[0].ravel() for x in (a, b))))
 
 
 def rebuilt(scene: Scene, frames_nm: FloatArray, config: PeptideConfig) -> dict[str, float]:

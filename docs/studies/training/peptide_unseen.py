@@ -1,19 +1,22 @@
 """Weights for peptides on molecules that they never saw, beside MD of these.
 
     python docs/studies/training/peptide_unseen.py FOLDER --weights W --test CAMPAIGN/test [--solvent tip3p]
-                               [--corrected THERE/train HERE/train] [--molecules NAME ...] [-o TABLE.json]
+          [--library CAMPAIGN/train] [--corrected THERE/train HERE/train] [--molecules NAME ...] [-o TABLE.json]
 
 Of each molecule the weights roll as many runs as MD has, of MD's first 10 ns the same, unguarded, at lags of 10 ps,
-100 ps and 1 ns (FOLDER/NAME). Torsions: mean Jensen-Shannon distance (root, natural logarithm, 50
-bins) over φ, ψ and χ, of one run to all others' MD (single), and of half of the runs to half of MD's (pooled), over
-that of MD itself; joint maps of ψ and the next φ (36 x 36) pooled. Kinetics: integrated correlation times of every cos
-ψ and along the two slowest TICA coordinates of MD, over MD's; of MD's halves beside it. Lags: root mean square
-difference of the populations of torsion states at 100 ps and 1 ns from those at 10 ps, over what MD's halves differ.
-A φ > 0 that MD enters fewer than ten times plays no part: frames that show it are left out of distances, runs that do
-out of kinetics (what its population is, `peptide_energies` and `peptide_gates seeds` say). Free chains of four, by
-MDGen's recipe: every other run of the model and of MD to the remaining runs of MD, and the first over the second.
-`--corrected`: rollouts in one solvent (HERE) weighed and stretched as runs of monomers in another say
-(`peptide_correction`). What is there is read.
+100 ps and 1 ns (FOLDER/NAME; what is there is read). Over MD's own:
+- torsions: mean Jensen-Shannon distance (root, natural logarithm, 50 bins) over φ, ψ and χ, of one run to all others'
+  MD (single), and of half of the runs to half of MD's (pooled); joint maps of ψ and the next φ (36 x 36) pooled;
+- kinetics: integrated correlation times of every cos ψ and along the two slowest TICA coordinates of MD;
+- lags: root mean square difference of the populations of torsion states at 100 ps and 1 ns from those at 10 ps;
+- free chains of four, by MDGen's recipe: every other run to the remaining runs of MD, the model's over MD's.
+A φ > 0 that MD enters fewer than ten times plays no part: frames that show it are left out of distances, as are pairs
+of runs one of which shows it half of the time, and runs that show it out of kinetics. How likely it is,
+`peptide_energies` and `peptide_gates seeds` say.
+
+Beside the model stand the first frames of MD's runs, as many as are simulated in the wall time of the rollout, and
+`--library`, torsions of monomers drawn without regard to neighbours (`peptide_scores`). `--corrected`: rollouts in one
+solvent (HERE) weighed and stretched as runs of monomers in another say (`peptide_correction`).
 """
 
 from __future__ import annotations
@@ -22,15 +25,16 @@ import argparse
 import json
 import math
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 from peptide_correction import Correction
-from peptide_rollouts import FRAMES_PS, rolled, thinned
-from peptide_scores import angles, rarely_positive, turns_of
+from peptide_rollouts import FRAMES_PS, frame_weights, rolled, thinned
+from peptide_scores import Turn, angles, library, rarely_positive, turns_of
+from peptide_transfer import trained_with
 
 from surrogate.comparison.measure.distributions import distance
 from surrogate.comparison.measure.kinetics import circular_features, fit_projection, tica_lag, zero_crossing
@@ -44,6 +48,7 @@ from surrogate.models.weights import Weights, load_weights
 from surrogate.sampling.domain import fit_weights
 from systems.chemistry.validity import INVALID, Geometry, check_frames
 from systems.scene import Scene
+from systems.trajectory.codec import open_trajectory
 
 FloatArray = npt.NDArray[np.float64]
 # Runs of torsions in rad, `(n_frames, n_torsions)` each.
@@ -120,6 +125,33 @@ def published(scene: Scene, md_nm: Runs, own_nm: Runs) -> dict[str, list[float]]
     return {name: [b, a, b / a] for name, a, b in zip(TABLE, floor, model, strict=True)}
 
 
+def of_monomers(
+    turns: Sequence[Turn], residues: Sequence[str], folder: Path, kt: Mapping[str, float], like: Runs
+) -> Runs | None:  # fmt: skip
+    """Return runs as many and as long as `like`, whose residues are drawn from runs of their monomers in a folder; None
+    where these do not have every torsion. `kt`: free energies of φ > 0, which short runs do not tell."""
+    each = [sorted((folder / name).glob("run_*.h5")) for name in residues]
+    if not all(each):
+        return None
+    alone = [thinned(files) for files in each]
+    own = [turns_of(scene) for scene, *_ in alone]
+    values = [[angles(t, x) for x in frames] for t, (_, frames, _) in zip(own, alone, strict=True)]
+    phi = [next(k for k, turn in enumerate(t) if turn.kind == "phi") for t in own]
+    likely = [frame_weights(x, k, kt.get(name)) for x, k, name in zip(values, phi, residues, strict=True)]
+    rng, whole = np.random.default_rng(SEED), [np.concatenate(x) for x in values]
+    try:
+        return [library(turns, whole, likely, own, len(x), rng) for x in like]
+    except KeyError:
+        return None
+
+
+def bought(md_files: Sequence[Path], rollouts: Sequence[Path]) -> float:
+    """Return the time of MD, ps of a run, that is simulated in the wall time of rollouts, as both files say."""
+    with open_trajectory(md_files[0]) as one, open_trajectory(rollouts[0]) as other:
+        rate = float(one.time_ps[-1]) / one.record["cost"]["wall_s"]
+        return rate * float(other.record["cost"]["wall_s"])
+
+
 def correlation_times_ps(series: Sequence[FloatArray]) -> FloatArray:
     """Return the integrated correlation time of each column of runs `(n_frames, k)`."""
     return FRAMES_PS * np.array([zero_crossing([x[:, k] for x in series])[1] for k in range(series[0].shape[1])])
@@ -160,16 +192,19 @@ def lag_errors(md: Runs, at_10: Runs, others: dict[float, Runs]) -> dict[str, fl
 
 
 def molecule(
-    weights: Weights, runs: Sequence[Path], folder: Path, solvent: str | None, correction: Correction | None = None
+    weights: Weights, runs: Sequence[Path], folder: Path, solvent: str | None, correction: Correction | None = None,
+    monomers: Path | None = None,
 ) -> dict[str, Any]:  # fmt: skip
     """Roll a molecule and return its line of the table."""
     scene, md_nm, time_ps = thinned(runs)
     time_ps = min(time_ps, RUN_PS)
     md_nm = [x[: round(time_ps / FRAMES_PS)] for x in md_nm]
 
+    def files(lag_ps: float) -> list[Path]:
+        return [folder / f"{lag_ps:g}ps-{k:02d}.h5" for k in range(len(runs))]
+
     def roll(lag_ps: float) -> list[FloatArray]:
-        outs = [folder / f"{lag_ps:g}ps-{k:02d}.h5" for k in range(len(runs))]
-        return rolled(weights, scene, outs, time_ps, lag_ps, solvent)
+        return rolled(weights, scene, files(lag_ps), time_ps, lag_ps, solvent)
 
     own_nm = roll(FRAMES_PS)
     fitted, _ = fit_weights(scene, weights, lag_ps=FRAMES_PS, force=True, solvent=solvent)
@@ -180,6 +215,8 @@ def molecule(
     md, of = ([angles(turns, x) for x in some] for some in (md_nm, own_nm))
     rare = rarely_positive(turns, md)
     counted = [[(~x).astype(np.float64) for x in shown(some, rare)] for some in (md, of)]
+    kept = [k for k, both in enumerate(zip(*counted, strict=True)) if min(x.mean() for x in both) >= 0.5]
+    md, of, *counted = ([some[k] for k in kept] for some in (md, of, *counted))
     at = {(t.kind, t.residue): k for k, t in enumerate(turns)}
     psi = [k for k, t in enumerate(turns) if t.kind == "psi"]
     pairs = [(k, at["phi", t.residue + 1]) for k, t in enumerate(turns)
@@ -189,6 +226,12 @@ def molecule(
         counted[1] = [a * correction.weights(turns, amino_acids, x) for a, x in zip(counted[1], of, strict=True)]
     one = densities(md, counted[0]), densities(of, counted[1])
     joint = (joint_densities(md, counted[0], pairs), joint_densities(of, counted[1], pairs)) if pairs else None
+    md_ps = bought(runs, files(FRAMES_PS))
+    first = max(1, round(md_ps / FRAMES_PS))
+    others: dict[str, Runs] = {f"MD of {len(md) * md_ps * 1e-3:.2g} ns": [x[:first] for x in md]}
+    drawn = monomers and of_monomers(turns, amino_acids, monomers, trained_with(weights.provenance), md)
+    if drawn:
+        others["library of monomers"] = drawn
     clock = 1.0 if correction is None else correction.clock
     usual = never(md, rare)
     return {
@@ -196,6 +239,10 @@ def molecule(
         "torsions, single": over(single, *one),
         "torsions, pooled": over(pooled, *one),
         "joint maps, pooled": None if joint is None else over(pooled, *joint),
+        "torsions, pooled, of others": {
+            name: over(pooled, one[0], densities(x, [(~there).astype(np.float64) for there in shown(x, rare)]))
+            for name, x in others.items()
+        },
         "MD's own, single": float(single(one[0], one[0]).mean()),
         "rare φ > 0": [f"{turns[k].kind} {turns[k].residue}" for k in rare],
         "kinetics": {name: clock * ratio for name, ratio in kinetics(usual, never(of, rare), psi).items()},
@@ -236,6 +283,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--test", type=Path, required=True)
     parser.add_argument("--solvent")
     parser.add_argument("--corrected", type=Path, nargs=2, metavar=("THERE", "HERE"))
+    parser.add_argument("--library", type=Path)
     parser.add_argument("--molecules", nargs="+")
     parser.add_argument("-o", "--out", type=Path)
     a = parser.parse_args(arguments)
@@ -245,7 +293,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         runs = sorted(place.glob("run_*.h5"))
         if len(runs) < 4 or (a.molecules and place.name not in a.molecules):
             continue
-        rows[place.name] = molecule(weights, runs, a.folder / place.name, a.solvent, correction)
+        rows[place.name] = molecule(weights, runs, a.folder / place.name, a.solvent, correction, a.library)
         sys.stdout.write(f"{place.name}: {json.dumps(rows[place.name], ensure_ascii=False)}\n")
         sys.stdout.flush()
     if not rows:
