@@ -36,6 +36,7 @@ from peptide_rollouts import FRAMES_PS, frame_weights, rolled, thinned
 from peptide_scores import Turn, angles, library, rarely_positive, turns_of
 from peptide_transfer import trained_with
 
+from md_reference.run.machine import machine_name
 from surrogate.comparison.measure.distributions import distance
 from surrogate.comparison.measure.kinetics import circular_features, fit_projection, tica_lag, zero_crossing
 from surrogate.comparison.measure.structure import Baseline
@@ -80,19 +81,26 @@ def single(md: Sequence[FloatArray], of: Sequence[FloatArray]) -> FloatArray:
     return np.array([mean_distance(whole - md[k], of[k]) for k in range(len(md))])
 
 
-def pooled(md: Sequence[FloatArray], of: Sequence[FloatArray]) -> FloatArray:
-    """Return the distances between random halves of MD's runs and as many of `of`, of the other numbers."""
+def pooled(md: Sequence[FloatArray], of: Sequence[FloatArray], but: int | None = None) -> FloatArray:
+    """Return the distances between random halves of MD's runs and as many of `of`, of the other numbers, but one."""
     rng, found = np.random.default_rng(SEED), []
     for _ in range(HALVES):
-        order = rng.permutation(len(md))
-        half = len(md) // 2
+        order = [k for k in rng.permutation(len(md)).tolist() if k != but]
+        half = len(order) // 2
         found.append(mean_distance(sum(md[k] for k in order[:half]), sum(of[k] for k in order[half : 2 * half])))
     return np.array(found)
 
 
-def over(measure: Callable[..., FloatArray], md: Sequence[FloatArray], of: Sequence[FloatArray]) -> float:
-    """Return a mean distance of `of` to MD over that of MD to itself."""
-    return float(measure(md, of).mean() / measure(md, md).mean())
+def over(measure: Callable[..., FloatArray], md: Sequence[FloatArray], of: Sequence[FloatArray]) -> list[float]:
+    """Return a mean distance of `of` to MD over that of MD to itself, and its standard error over runs."""
+    if measure is single:
+        found, floor = single(md, of), single(md, md)
+        ratio = found.mean() / floor.mean()
+        relative = [x.std(ddof=1) / x.mean() / math.sqrt(len(x)) for x in (found, floor)]
+        return [float(ratio), float(ratio * math.hypot(*relative))]
+    each = [float(pooled(md, of, k).mean() / pooled(md, md, k).mean()) for k in range(len(md))]
+    jackknife = math.sqrt((len(md) - 1) * float(np.var(each)))
+    return [float(pooled(md, of).mean() / pooled(md, md).mean()), jackknife]
 
 
 def shown(runs: Runs, rare: Sequence[int]) -> list[npt.NDArray[np.bool_]]:
@@ -257,7 +265,7 @@ def summary(rows: dict[str, dict[str, Any]]) -> list[str]:
     """Return the gates, a line each."""
     lines = []
     for what in ("torsions, single", "torsions, pooled", "joint maps, pooled"):
-        found = [row[what] for row in rows.values() if row[what] is not None]
+        found = [row[what][0] for row in rows.values() if row[what]]
         if found:
             lines.append(f"{what}: mean {np.mean(found):.2f}, at most {max(found):.2f} of {len(found)}")
     for what in ("kinetics", "kinetics of MD's halves"):
@@ -274,6 +282,30 @@ def summary(rows: dict[str, dict[str, Any]]) -> list[str]:
         lines.append(f"MDGen's recipe, {column}: {np.nanmean([one[column][2] for one in tables]):.2f} of {len(tables)}")
     lines.append(f"valid: {np.mean([row['valid, %: MD, model'][1] for row in rows.values()]):.2f} %")
     return lines
+
+
+COLUMNS = (
+    "molecule", "frames", "torsions, one run", "torsions, pooled", "MD of the same wall time", "library of monomers",
+    "joint maps, pooled", "correlation times", "those of MD's halves", "populations at 100 ps, 1 ns", "valid, %",
+)  # fmt: skip
+
+
+def table_row(name: str, row: dict[str, Any]) -> list[Any]:
+    """Return a molecule's line of the table, all but the frames and their validity over MD's own."""
+
+    def ratio(found: Sequence[float] | None) -> str:
+        return "-" if not found else f"{found[0]:.2f} ± {found[1]:.2f}"
+
+    def between(found: dict[str, float]) -> str:
+        return f"{min(found.values()):.2f} to {max(found.values()):.2f}"
+
+    (md, bought_then), *others = row["torsions, pooled, of others"].items()
+    return [
+        name, row["frames"], ratio(row["torsions, single"]), ratio(row["torsions, pooled"]),
+        f"{ratio(bought_then)} ({md.removeprefix('MD of ')})", ratio(others[0][1] if others else None),
+        ratio(row["joint maps, pooled"]), between(row["kinetics"]), between(row["kinetics of MD's halves"]),
+        ", ".join(f"{x:.2f}" for x in row["lags"].values()), f"{row['valid, %: MD, model'][1]:.2f}",
+    ]  # fmt: skip
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -300,7 +332,14 @@ def main(arguments: Sequence[str] | None = None) -> None:
         raise SystemExit(f"{a.test} holds no molecule with four runs or more.")
     sys.stdout.write("\n".join(summary(rows)) + "\n")
     if a.out is not None:
-        table = {"weights": weights.hash, "solvent": a.solvent, "summary": summary(rows), "rows": rows}
+        given = [f"--weights {a.weights}", "--test CAMPAIGN/test", *(["--solvent", a.solvent] if a.solvent else [])]
+        table = {
+            "columns": COLUMNS,
+            "rows": [table_row(*each) for each in rows.items()],
+            "command": " ".join(["python docs/studies/training/peptide_unseen.py FOLDER", *given]),
+            "machine": machine_name(),
+            "note": "; ".join(summary(rows)) + ".",
+        }
         a.out.write_text(json.dumps(table, indent=1, ensure_ascii=False) + "\n", "utf-8")
 
 
