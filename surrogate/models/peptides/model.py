@@ -183,9 +183,11 @@ class StateJumps(nn.Module):
             h = h + self.of_new_states(conditioning)
             total = observed.new_zeros(())
             for torsion in torch.nonzero((counts > 0).any(0))[:, 0].tolist():
-                has = counts[:, torsion] > 0
-                logits = self.probabilities(torsion, h, levels, before[..., torsion], conditioning)[:, :, has]
-                chosen = new[..., has, torsion]
+                has = torch.nonzero(counts[:, torsion])[:, 0]
+                now, chosen = before[..., has, torsion], new[..., has, torsion]
+                earlier_torsions = conditioning[..., : torsion * MOST_STATES].index_select(2, has)
+                own = h.index_select(2, has), levels.index_select(3, has), now, earlier_torsions
+                logits = self.probabilities(torsion, *own)
                 each = F.cross_entropy(logits.flatten(0, -2), chosen.flatten(), reduction="none").reshape(chosen.shape)
                 total = total + (each if share is None else share[:, None, has, torsion] * each).sum()
             return total / (times_ps.numel() * max(1, int((counts > 0).sum())))
