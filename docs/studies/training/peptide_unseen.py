@@ -37,6 +37,7 @@ from peptide_scores import Turn, angles, library, rarely_positive, turns_of
 from peptide_transfer import trained_with
 
 from md_reference.run.machine import machine_name
+from surrogate.api import compare
 from surrogate.comparison.measure.distributions import distance
 from surrogate.comparison.measure.kinetics import circular_features, fit_projection, tica_lag, zero_crossing
 from surrogate.comparison.measure.structure import Baseline
@@ -153,6 +154,16 @@ def of_monomers(
         return None
 
 
+def worst(md_files: Sequence[Path], rollouts: Sequence[Path]) -> tuple[float, str]:
+    """Return the equivalent MD time by the worst measure, ns and in words, as `surromd compare` states it of every other rollout beside
+    as many runs of MD, the other runs of which are the replicate; a report lies beside the rollouts."""
+    report = rollouts[0].parent / "report.html"
+    compared = compare(md_files[::2], [rollouts[::2]], report, replicate=md_files[1::2], overwrite=True)
+    found = compared.evaluations[0].equivalent_time
+    least = min(found, key=lambda by: by.equivalent_ps, default=None)
+    return (math.nan, "-") if least is None else (least.equivalent_ps * 1e-3, least.in_words())
+
+
 def bought(md_files: Sequence[Path], rollouts: Sequence[Path]) -> float:
     """Return the time of MD, ps of a run, that is simulated in the wall time of rollouts, as both files say."""
     with open_trajectory(md_files[0]) as one, open_trajectory(rollouts[0]) as other:
@@ -251,6 +262,7 @@ def molecule(
             name: over(pooled, one[0], densities(x, [(~there).astype(np.float64) for there in shown(x, rare)]))
             for name, x in others.items()
         },
+        "equivalent MD time": worst(runs, files(FRAMES_PS)),
         "MD's own, single": float(single(one[0], one[0]).mean()),
         "rare φ > 0": [f"{turns[k].kind} {turns[k].residue}" for k in rare],
         "kinetics": {name: clock * ratio for name, ratio in kinetics(usual, never(of, rare), psi).items()},
@@ -277,6 +289,8 @@ def summary(rows: dict[str, dict[str, Any]]) -> list[str]:
         lines.append(
             f"populations at {lag:g} ps: {np.mean(found):.2f} of what MD's halves differ, at most {max(found):.2f}"
         )
+    found = [row["equivalent MD time"][0] for row in rows.values()]
+    lines.append(f"equivalent MD time by the worst measure: median {np.nanmedian(found):.3g} ns")
     tables = [row["MDGen's recipe"] for row in rows.values() if row["MDGen's recipe"]]
     for column in TABLE if tables else ():
         lines.append(f"MDGen's recipe, {column}: {np.nanmean([one[column][2] for one in tables]):.2f} of {len(tables)}")
@@ -286,7 +300,8 @@ def summary(rows: dict[str, dict[str, Any]]) -> list[str]:
 
 COLUMNS = (
     "molecule", "frames", "torsions, one run", "torsions, pooled", "MD of the same wall time", "library of monomers",
-    "joint maps, pooled", "correlation times", "those of MD's halves", "populations at 100 ps, 1 ns", "valid, %",
+    "joint maps, pooled", "equivalent MD time by the worst measure", "correlation times", "those of MD's halves",
+    "populations at 100 ps, 1 ns", "valid, %",
 )  # fmt: skip
 
 
@@ -303,7 +318,8 @@ def table_row(name: str, row: dict[str, Any]) -> list[Any]:
     return [
         name, row["frames"], ratio(row["torsions, single"]), ratio(row["torsions, pooled"]),
         f"{ratio(bought_then)} ({md.removeprefix('MD of ')})", ratio(others[0][1] if others else None),
-        ratio(row["joint maps, pooled"]), between(row["kinetics"]), between(row["kinetics of MD's halves"]),
+        ratio(row["joint maps, pooled"]), row["equivalent MD time"][1],
+        between(row["kinetics"]), between(row["kinetics of MD's halves"]),
         ", ".join(f"{x:.2f}" for x in row["lags"].values()), f"{row['valid, %: MD, model'][1]:.2f}",
     ]  # fmt: skip
 
