@@ -155,8 +155,8 @@ def of_monomers(
 
 
 def worst(md_files: Sequence[Path], rollouts: Sequence[Path]) -> tuple[float, str]:
-    """Return the equivalent MD time by the worst measure, ns and in words, as `surromd compare` states it of every other rollout beside
-    as many runs of MD, the other runs of which are the replicate; a report lies beside the rollouts."""
+    """Return the equivalent MD time by the worst measure, ns and in words, as `surromd compare` states it of every
+    other rollout beside as many runs of MD, with the other runs of MD as the replicate; its report stays there."""
     report = rollouts[0].parent / "report.html"
     compared = compare(md_files[::2], [rollouts[::2]], report, replicate=md_files[1::2], overwrite=True)
     found = compared.evaluations[0].equivalent_time
