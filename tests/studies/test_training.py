@@ -30,6 +30,7 @@ from peptide_list import (
 )
 from peptide_scores import Turn
 
+from surrogate.comparison.rows.published_metrics import TABLE
 from systems.errors import InputError
 from systems.prepare.peptide import build_peptide
 from systems.trajectory.codec import open_trajectory
@@ -186,6 +187,17 @@ def test_a_rare_positive_phi_plays_no_part() -> None:
     for x in md[:5]:
         x[:10, 0] = 1.0
     assert len(peptide_unseen.never(md, [0])) == 8, "too few are without"
+
+
+def test_mdgens_recipe_is_over_a_replicate() -> None:
+    scene = build_peptide("ALA-GLY-ALA-SER")
+    noise = np.random.default_rng(0).normal(size=(5, 600, scene.n_atoms, 3)).cumsum(axis=1)
+    runs = [scene.positions_nm + 0.02 * np.tanh(0.05 * x) for x in noise]
+    stiff = [scene.positions_nm + 0.1 * (x - scene.positions_nm) for x in runs]
+    same, off = (peptide_unseen.published(scene, runs, of) for of in (runs, stiff))
+    assert same is not None and off is not None and same.keys() == {*TABLE}
+    assert [same[name][2] for name in TABLE[:5]] == pytest.approx([1.0] * 5)
+    assert off["all torsions"][2] > 1.2 and off["all torsions"][1] == same["all torsions"][1]
 
 
 def test_kinetics_and_lags_are_over_those_of_md() -> None:
