@@ -9,6 +9,7 @@ from pathlib import Path
 
 import lag_errors
 import numpy as np
+import peptide_campaign
 import peptide_correction
 import peptide_runs
 import peptide_seeds
@@ -213,9 +214,12 @@ def test_kinetics_and_lags_are_over_those_of_md() -> None:
 
 
 def test_no_training_takes_what_is_tested_by(tmp_path: Path) -> None:
-    (tmp_path / "train" / "GLN-ILE").mkdir(parents=True)
-    with pytest.raises(InputError, match="weights are tested on GLN-ILE"):
-        peptide_transfer.sets_of([tmp_path / "train"], 16)
+    for name in ("GLN-ILE", "free-GLN-ILE", "GLY-VAL"):
+        (tmp_path / name / name).mkdir(parents=True)
+        with pytest.raises(InputError, match="weights are tested on these residues"):
+            peptide_transfer.sets_of([tmp_path / name], 16)
+    tested = {p.residues for kind, p, _ in peptide_campaign.order("obc2") if kind == "test" and len(p.residues) > 1}
+    assert not tested & {p.residues for kind, p, _ in peptide_campaign.order("obc2") if kind != "test"}
     assert peptide_transfer.trained_with({"from": {"from": {"positive_phi_kt": {"ALA": 4.0}}}}) == {"ALA": 4.0}
 
 

@@ -124,8 +124,10 @@ def batch(folder: Path, peptide: Peptide, number: int, solvent: str, every_ps: f
 def order(solvent: str) -> list[tuple[str, Peptide, int]]:
     """Return every batch: where its files go, the molecule and the number."""
     if solvent == IMPLICIT.solvent:
-        fine = [replace(p, time_ps=FINE_PS) for p in training_peptides()[: 2 * len(RESIDUES)]]
         tests, train = unseen_peptides(), wide_peptides()
+        tested = {p.residues for p in tests if len(p.residues) > 1}
+        round_one = training_peptides()[: 2 * len(RESIDUES)]
+        fine = [replace(p, time_ps=FINE_PS) for p in round_one if p.residues not in tested]
         kinds = (("test", tests[:FIRST_TESTS]), ("train", train[: len(RESIDUES)]), ("fine", fine),
                  ("train", train[len(RESIDUES) :]), ("test", tests[FIRST_TESTS:]))  # fmt: skip
         return [(kind, p, 0) for kind, some in kinds for p in some]

@@ -34,12 +34,13 @@ _VALIDATE_S = 300.0
 
 
 def sets_of(folders: Sequence[Path], runs: int) -> list[TrainingFrames]:
-    """Return the frames of every molecule in folders. Raises InputError for one that weights are tested on, or none."""
-    tested = {p.name for p in (*unseen_peptides(), *held_out_peptides()) if len(p.residues) > 1}
+    """Return the frames of every molecule in folders. Raises InputError for none, and for residues that weights are
+    tested on, whatever their ends."""
+    tested = {"-".join(p.residues) for p in (*unseen_peptides(), *held_out_peptides()) if len(p.residues) > 1}
     found = []
     for place in (place for folder in folders for place in sorted(folder.iterdir()) if place.is_dir()):
-        if place.name in tested:
-            raise InputError(f"{place}: weights are tested on {place.name}; leave it out of training.")
+        if place.name.removeprefix("free-") in tested:
+            raise InputError(f"{place}: weights are tested on these residues; leave it out of training.")
         if files := sorted(place.glob("run_*.h5"))[:runs]:
             found.append(collect_frames(files))
     if not found:

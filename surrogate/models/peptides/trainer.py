@@ -245,7 +245,7 @@ def train_peptides(
     held = [
         (name, subject, *subject.windows(n_held, config, torch.Generator().manual_seed(_HELD_SEED),
                                          validation=name == "validation"))
-        for name, some in (("validation", subjects), ("unseen", held_out)) for subject in some
+        for name, some in (("validation", long_enough(subjects, config)), ("unseen", held_out)) for subject in some
     ]  # fmt: skip
 
     def flow_loss(generator: torch.Generator) -> tuple[Tensor, dict[str, Tensor]]:
@@ -299,6 +299,16 @@ def train_peptides(
 
     train_stages(in_turn(), out, write, device=device, resume=resume, progress=progress)
     return out
+
+
+def long_enough(subjects: Sequence[PeptideSubject], config: PeptideConfig) -> list[PeptideSubject]:
+    """Return the peptides of which the part held out is longer than a chunk, all of them where none is."""
+
+    def held(subject: PeptideSubject) -> int:
+        ranges = subject.frames.split.ranges(subject.frames.starts, validation=True)
+        return max((high - low for low, high in ranges), default=0)
+
+    return [subject for subject in subjects if held(subject) > config.chunk_frames] or list(subjects)
 
 
 def peptides_domain(sets: Sequence[TrainingFrames], config: PeptideConfig) -> TrainingDomain:

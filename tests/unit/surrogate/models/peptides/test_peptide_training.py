@@ -363,6 +363,14 @@ def test_a_flow_is_taught_to_end_in_two_evaluations_where_it_ended_in_six(
     assert (on.usual_steps, on.solvers[0]) == (6, "gaussian")
 
 
+def test_runs_too_short_to_hold_a_chunk_out_are_trained_on_without(frames: TrainingFrames, tmp_path: Path) -> None:
+    short = replace(frames, split=Split(0.01))
+    once = PeptideTraining(steps=1)
+    load_weights(train_peptides([frames, short], tmp_path / "a.safetensors", SMALL, once))
+    with pytest.raises(InputError, match="hold no window of 4 frames"):
+        train_peptides([short], tmp_path / "b.safetensors", SMALL, once)
+
+
 def test_probabilities_of_states_can_be_trained_alone_and_coupled(frames: TrainingFrames, tmp_path: Path) -> None:
     first = train_peptides(
         [frames], tmp_path / "a.safetensors", replace(SMALL, usual_steps=3), PeptideTraining(steps=2)
