@@ -25,17 +25,20 @@ import argparse
 import json
 import math
 import sys
+import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+from peptide_campaign import IMPLICIT, dynamics
 from peptide_correction import Correction
 from peptide_rollouts import FRAMES_PS, frame_weights, rolled, thinned
 from peptide_scores import Turn, angles, library, rarely_positive, turns_of
 from peptide_transfer import trained_with
 
+from md_reference.forces.forcefield import build_system
 from md_reference.run.machine import machine_name
 from surrogate.api import compare
 from surrogate.comparison.measure.distributions import distance
@@ -56,6 +59,8 @@ FloatArray = npt.NDArray[np.float64]
 # Runs of torsions in rad, `(n_frames, n_torsions)` each.
 Runs = Sequence[FloatArray]
 RUN_PS, LAGS_PS, BINS, JOINT_BINS, HALVES, SEED = 10_000.0, (100.0, 1000.0), 50, 36, 10, 0
+# By so many steps the pace of MD is measured; it is that of steps of 4 fs, as the runs have.
+PACE_STEPS, TIMESTEP_PS = 5000, 0.004
 
 
 def densities(runs: Runs, weights: Runs) -> list[FloatArray]:
@@ -164,11 +169,21 @@ def worst(md_files: Sequence[Path], rollouts: Sequence[Path]) -> tuple[float, st
     return (math.nan, "-") if least is None else (least.equivalent_ps * 1e-3, least.in_words())
 
 
-def bought(md_files: Sequence[Path], rollouts: Sequence[Path]) -> float:
-    """Return the time of MD, ps of a run, that is simulated in the wall time of rollouts, as both files say."""
-    with open_trajectory(md_files[0]) as one, open_trajectory(rollouts[0]) as other:
-        rate = float(one.time_ps[-1]) / one.record["cost"]["wall_s"]
-        return rate * float(other.record["cost"]["wall_s"])
+def bought(scene: Scene, frame_nm: FloatArray, md_file: Path, rollout: Path) -> float:
+    """Return the time of MD, ps of each of sixteen replicas, that a core simulates in the wall time of a rollout: in
+    OBC2 at the pace of some steps of MD now, in water as the file of MD says."""
+    with open_trajectory(md_file) as one, open_trajectory(rollout) as other:
+        spent_s, implicit = float(other.record["cost"]["wall_s"]), one.record["solvent"] == IMPLICIT.solvent
+        pace = float(one.time_ps[-1]) / float(one.record["cost"]["wall_s"])
+    if implicit:
+        run = dynamics(build_system(scene, IMPLICIT), 300.0, SEED)
+        run.set_positions(np.repeat(frame_nm[None], run.n_replicas, axis=0))
+        run.thermalise()
+        began = time.perf_counter()
+        run.step(PACE_STEPS)
+        # Of a replica; `pace` and `spent_s` are shares of a batch.
+        pace = run.n_replicas * PACE_STEPS * TIMESTEP_PS / (time.perf_counter() - began)
+    return pace * spent_s
 
 
 def correlation_times_ps(series: Sequence[FloatArray]) -> FloatArray:
@@ -245,7 +260,7 @@ def molecule(
         counted[1] = [a * correction.weights(turns, amino_acids, x) for a, x in zip(counted[1], of, strict=True)]
     one = densities(md, counted[0]), densities(of, counted[1])
     joint = (joint_densities(md, counted[0], pairs), joint_densities(of, counted[1], pairs)) if pairs else None
-    md_ps = bought(runs, files(FRAMES_PS))
+    md_ps = bought(scene, md_nm[0][-1], runs[0], files(FRAMES_PS)[0])
     first = max(1, round(md_ps / FRAMES_PS))
     others: dict[str, Runs] = {f"MD of {len(md) * md_ps * 1e-3:.2g} ns": [x[:first] for x in md]}
     drawn = monomers and of_monomers(turns, amino_acids, monomers, trained_with(weights.provenance), md)
