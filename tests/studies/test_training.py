@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections import Counter
 from dataclasses import replace
 from pathlib import Path
@@ -212,6 +213,21 @@ def test_kinetics_and_lags_are_over_those_of_md() -> None:
     moved = [np.where(x > 0.3, 2.0, -2.0) + 0.1 * x for x in md]
     errors = peptide_unseen.lag_errors(two, two, {100.0: two, 1000.0: moved})
     assert errors["100 ps"] == 0.0 and errors["1000 ps"] > 3.0
+
+
+def test_the_farthest_state_is_named_with_both_populations() -> None:
+    turns = [Turn("phi", 0, (0, 1, 2, 3)), Turn("psi", 0, (0, 1, 2, 3))]
+    rng = np.random.default_rng(0)
+
+    def runs(share: float) -> list[np.ndarray]:
+        sides = rng.random((8, 1000, 2)) < (0.1, share)
+        return list(np.where(sides, 1.5, -1.5) + 0.2 * rng.normal(size=(8, 1000, 2)))
+
+    md, of = runs(0.3), runs(0.6)
+    found = peptide_unseen.farthest_state(turns, ["ALA"], md, of, [])
+    shares = re.fullmatch(r"psi of ALA 1, -180° to 0°: (\d+) ± [01] for (\d+) ± [01] %", found)
+    assert shares and abs(int(shares[1]) - 40) <= 2 and abs(int(shares[2]) - 70) <= 2
+    assert peptide_unseen.farthest_state(turns, ["ALA"], md, of, [1]).startswith("phi of ALA 1, ")
 
 
 def test_no_training_takes_what_is_tested_by(tmp_path: Path) -> None:

@@ -225,6 +225,21 @@ def lag_errors(md: Runs, at_10: Runs, others: dict[float, Runs]) -> dict[str, fl
             for lag, x in others.items()}  # fmt: skip
 
 
+def farthest_state(turns: Sequence[Turn], residues: Sequence[str], md: Runs, of: Runs, rare: Sequence[int]) -> str:
+    """Return the state of a torsion, but of `rare` ones, whose population is farthest from MD's, and both populations
+    with standard errors over runs."""
+    kept = [k for k in range(len(turns)) if k not in rare]
+    turns, md, of = [turns[k] for k in kept], [x[:, kept] for x in md], [x[:, kept] for x in of]
+    wells = [find_wells([x[:, k] for x in md], fold=t.fold) for k, t in enumerate(turns)]
+    each = [np.array([populations(wells, [x]) for x in some]) for some in (md, of)]
+    here, there = ((x.mean(axis=0), x.std(axis=0, ddof=1) / math.sqrt(len(x))) for x in each)
+    names = [f"{t.kind} of {residues[t.residue]} {t.residue + 1}, {name}"
+             for t, w in zip(turns, wells, strict=True) for name in w.names]  # fmt: skip
+    k = int(np.abs(here[0] - there[0]).argmax())
+    percent = [f"{100 * mean[k]:.0f} ± {100 * error[k]:.0f}" for mean, error in (there, here)]
+    return f"{names[k]}: {percent[0]} for {percent[1]} %"
+
+
 def molecule(
     weights: Weights, runs: Sequence[Path], folder: Path, solvent: str | None, correction: Correction | None = None,
     monomers: Path | None = None,
@@ -279,6 +294,7 @@ def molecule(
         },
         "equivalent MD time": worst(runs, files(FRAMES_PS)),
         "MD's own, single": float(single(one[0], one[0]).mean()),
+        "farthest state": farthest_state(turns, amino_acids, md, of, rare),
         "rare φ > 0": [f"{turns[k].kind} {turns[k].residue}" for k in rare],
         "kinetics": {name: clock * ratio for name, ratio in kinetics(usual, never(of, rare), psi).items()},
         "kinetics of MD's halves": kinetics(usual[::2], usual[1::2], psi),
@@ -316,7 +332,7 @@ def summary(rows: dict[str, dict[str, Any]]) -> list[str]:
 COLUMNS = (
     "molecule", "frames", "torsions, one run", "torsions, pooled", "MD of the same wall time", "library of monomers",
     "joint maps, pooled", "equivalent MD time by the worst measure", "correlation times", "those of MD's halves",
-    "populations at 100 ps, 1 ns", "valid, %",
+    "populations at 100 ps, 1 ns", "valid, %", "farthest state of a torsion, model for MD",
 )  # fmt: skip
 
 
@@ -336,6 +352,7 @@ def table_row(name: str, row: dict[str, Any]) -> list[Any]:
         ratio(row["joint maps, pooled"]), row["equivalent MD time"][1],
         between(row["kinetics"]), between(row["kinetics of MD's halves"]),
         ", ".join(f"{x:.2f}" for x in row["lags"].values()), f"{row['valid, %: MD, model'][1]:.2f}",
+        row["farthest state"],
     ]  # fmt: skip
 
 
@@ -363,7 +380,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
         raise SystemExit(f"{a.test} holds no molecule with four runs or more.")
     sys.stdout.write("\n".join(summary(rows)) + "\n")
     if a.out is not None:
-        given = [f"--weights {a.weights}", "--test CAMPAIGN/test", *(["--solvent", a.solvent] if a.solvent else [])]
+        given = [f"--weights {a.weights}", "--test CAMPAIGN/test", *(["--solvent", a.solvent] if a.solvent else []),
+                 *(["--library CAMPAIGN/train"] if a.library else [])]  # fmt: skip
         table = {
             "columns": COLUMNS,
             "rows": [table_row(*each) for each in rows.items()],
