@@ -1,13 +1,14 @@
 """Train weights for peptides on runs in one solvent or several, from nothing or from others.
 
     python docs/studies/training/peptide_transfer.py OUT.safetensors --train FOLDER [FOLDER ...] --budget 1h
-               [--start WEIGHTS] [--tuned all|states|solvent] [--coupled] [--runs 16] [--steps N] [--unseen 12]
+               [--start WEIGHTS] [--tuned all|states|solvent] [--coupled] [--runs 16] [--steps N] [--unseen 12] [--half]
 
 FOLDER: `train` in a folder of `peptide_campaign` or `peptide_runs`, of each molecule in it the first `--runs`. `states`
 trains the probabilities of torsion states alone, `solvent` what a solvent has of its own (means, scales, correlations,
 levels and two embeddings); both need `--start`. `--unseen`: every so many molecules of several residues one is left
-out, and the curves show its loss. Free energies of φ > 0 are those of `peptide_energies` beside OUT, or
-those that the weights gone on from were trained with. A training that was stopped goes on.
+out, and the curves show its loss. `--half` rounds to float16 at the end. Free energies of φ > 0 are those of
+`peptide_energies` beside OUT, or those that the weights gone on from were trained with. A training that was stopped
+goes on.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ from surrogate.data import TrainingFrames, collect_frames
 from surrogate.models.architecture import weights_path
 from surrogate.models.peptides.layout import PeptideConfig
 from surrogate.models.peptides.trainer import TUNED, PeptideTraining, train_peptides
-from surrogate.models.weights import load_weights
+from surrogate.models.weights import load_weights, save_weights
 from systems.errors import InputError
 from systems.units import parse_wall_s
 
@@ -68,6 +69,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--unseen", type=int, default=0)
     parser.add_argument("--budget", type=lambda text: parse_wall_s(text, "--budget"))
     parser.add_argument("--steps", type=int)
+    parser.add_argument("--half", action="store_true")
     a = parser.parse_args(arguments)
     if is_trained(a.out):
         return
@@ -87,6 +89,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
         validate_every_s=_VALIDATE_S,
     )  # fmt: skip
     train_peptides(sets, a.out, PeptideConfig(coupled=a.coupled), training, unseen=unseen, start=start, resume=True)
+    if a.half:
+        found = load_weights(a.out)
+        save_weights(a.out, found.model, found.domain, found.provenance, half=True)
 
 
 if __name__ == "__main__":
