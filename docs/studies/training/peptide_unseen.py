@@ -61,6 +61,8 @@ Runs = Sequence[FloatArray]
 RUN_PS, LAGS_PS, BINS, JOINT_BINS, HALVES, SEED = 10_000.0, (100.0, 1000.0), 50, 36, 10, 0
 # By so many steps the pace of MD is measured; it is that of steps of 4 fs, as the runs have.
 PACE_STEPS, TIMESTEP_PS = 5000, 0.004
+# Columns of the first table; the others make a second one.
+DISTANCES = 7
 
 
 def densities(runs: Runs, weights: Runs) -> list[FloatArray]:
@@ -329,15 +331,8 @@ def summary(rows: dict[str, dict[str, Any]]) -> list[str]:
     return lines
 
 
-COLUMNS = (
-    "molecule", "frames", "torsions, one run", "torsions, pooled", "MD of the same wall time", "library of monomers",
-    "joint maps, pooled", "equivalent MD time by the worst measure", "correlation times", "those of MD's halves",
-    "populations at 100 ps, 1 ns", "valid, %", "farthest state of a torsion, model for MD",
-)  # fmt: skip
-
-
-def table_row(name: str, row: dict[str, Any]) -> list[Any]:
-    """Return a molecule's line of the table, all but the frames and their validity over MD's own."""
+def table_row(name: str, row: dict[str, Any]) -> dict[str, Any]:
+    """Return a molecule's line of the tables, by column; distances, correlation times and populations over MD's own."""
 
     def ratio(found: Sequence[float] | None) -> str:
         return "-" if not found else f"{found[0]:.2f} ± {found[1]:.2f}"
@@ -346,14 +341,20 @@ def table_row(name: str, row: dict[str, Any]) -> list[Any]:
         return f"{min(found.values()):.2f} to {max(found.values()):.2f}"
 
     (md, bought_then), *others = row["torsions, pooled, of others"].items()
-    return [
-        name, row["frames"], ratio(row["torsions, single"]), ratio(row["torsions, pooled"]),
-        f"{ratio(bought_then)} ({md.removeprefix('MD of ')})", ratio(others[0][1] if others else None),
-        ratio(row["joint maps, pooled"]), row["equivalent MD time"][1],
-        between(row["kinetics"]), between(row["kinetics of MD's halves"]),
-        ", ".join(f"{x:.2f}" for x in row["lags"].values()), f"{row['valid, %: MD, model'][1]:.2f}",
-        row["farthest state"],
-    ]  # fmt: skip
+    return {
+        "molecule": name,
+        "frames": row["frames"],
+        "torsions, one run": ratio(row["torsions, single"]),
+        "torsions, pooled": ratio(row["torsions, pooled"]),
+        "MD of the same wall time": f"{ratio(bought_then)} ({md.removeprefix('MD of ')})",
+        "library of monomers": ratio(others[0][1] if others else None),
+        "joint maps, pooled": ratio(row["joint maps, pooled"]),
+        "equivalent MD time": row["equivalent MD time"][1],
+        "correlation times": between(row["kinetics"]),
+        "MD's halves": between(row["kinetics of MD's halves"]),
+        "populations at 100 ps, 1 ns": ", ".join(f"{x:.2f}" for x in row["lags"].values()),
+        "farthest state of a torsion, for MD's": row["farthest state"],
+    }
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -382,14 +383,16 @@ def main(arguments: Sequence[str] | None = None) -> None:
     if a.out is not None:
         given = [f"--weights {a.weights}", "--test CAMPAIGN/test", *(["--solvent", a.solvent] if a.solvent else []),
                  *(["--library CAMPAIGN/train"] if a.library else [])]  # fmt: skip
-        table = {
-            "columns": COLUMNS,
-            "rows": [table_row(*each) for each in rows.items()],
-            "command": " ".join(["python docs/studies/training/peptide_unseen.py FOLDER", *given]),
-            "machine": machine_name(),
-            "note": "; ".join(summary(rows)) + ".",
-        }
-        a.out.write_text(json.dumps(table, indent=1, ensure_ascii=False) + "\n", "utf-8")
+        lines = [table_row(*each) for each in rows.items()]
+        columns = list(lines[0])
+        about = {"command": " ".join(["python docs/studies/training/peptide_unseen.py FOLDER", *given]),
+                 "machine": machine_name()}  # fmt: skip
+        for out, shown_here, note in (
+            (a.out, columns[:DISTANCES], "; ".join(summary(rows)) + "."),
+            (a.out.with_stem(f"{a.out.stem}_states"), [columns[0], *columns[DISTANCES:]], ""),
+        ):
+            table = {"columns": shown_here, "rows": [[line[key] for key in shown_here] for line in lines], **about}
+            out.write_text(json.dumps(table | {"note": note}, indent=1, ensure_ascii=False) + "\n", "utf-8")
 
 
 if __name__ == "__main__":
