@@ -7,7 +7,7 @@ drawn in the same way: `OUT/MOLECULE/fine.windows.h5` and `wide.windows.h5`, win
 Other recipes take OUT as `--train`. What is held out of all runs is not trained on here either.
 
 The flow is what a GPU is for. How likely states are, stretches do not tell: weights trained on them are where a short
-training on all runs starts (`peptide_gates pairs --from`).
+training on all runs starts (`peptide_transfer --start`).
 
 `measure OUT --train RUNS/train`: trains on a tenth of the molecules, of all their runs and of OUT, equally many steps,
 and prints how far the flow's loss on what all runs hold out differs.
