@@ -235,8 +235,9 @@ def test_no_training_takes_what_is_tested_by(tmp_path: Path) -> None:
         (tmp_path / name / name).mkdir(parents=True)
         with pytest.raises(InputError, match="weights are tested on these residues"):
             peptide_transfer.sets_of([tmp_path / name], 16)
-    tested = {p.residues for kind, p, _ in peptide_campaign.order("obc2") if kind == "test" and len(p.residues) > 1}
-    assert not tested & {p.residues for kind, p, _ in peptide_campaign.order("obc2") if kind != "test"}
+    orders = [peptide_campaign.order(solvent) for solvent in ("obc2", "tip3p")]
+    tested = {p.residues for order in orders for kind, p, _ in order if kind == "test" and len(p.residues) > 1}
+    assert not tested & {p.residues for order in orders for kind, p, _ in order if kind != "test"}
     assert peptide_transfer.trained_with({"from": {"from": {"positive_phi_kt": {"ALA": 4.0}}}}) == {"ALA": 4.0}
 
 

@@ -6,10 +6,10 @@
 ff14SB, 300 K, 4 fs. Each batch is sixteen runs `FOLDER/{test,train,fine}/NAME/run_000.h5`, ... that begin in other
 states: sixteen replicas in OBC2, 100 ps at 500 K and 100 ps at 300 K. In water (NVT at the volume of 1 bar, PME, frames
 1 ps apart without water) the replicas are turned to the torsions of these; in OBC2 (the wide campaign, frames 5 ps
-apart) they go on from them, those of `fine` 300 ps long and frames 1 ps apart. 50 ps after that are left out. What is
-tested by first, then what is trained on; in OBC2 the further half of the tests last, in water in rounds, the first of
-which has the monomers and every residue once at either place of a pair. What is there is left alone and what was
-stopped goes on.
+apart) they go on from them, those of `fine` 300 ps long and frames 1 ps apart. The first 25 ps in water and 50 ps in
+OBC2 are left out. In OBC2 half of the tests come first and the other half last; in water the residues that the first
+tests are made of, these tests, the other monomers, pairs with every residue once at either place, further tests and
+pairs and chains, then more runs of all. What is there is left alone and what was stopped goes on.
 """
 
 from __future__ import annotations
@@ -38,17 +38,17 @@ from systems.prepare.peptide import build_peptide
 from systems.scene import FloatArray, IntArray, Scene
 
 WATER, IMPLICIT = ForceFieldSpec("ff14SB", "tip3p"), ForceFieldSpec("ff14SB", "obc2")
-# Pairs and chains are not among the training peptides, in no solvent; monomers are tested on runs of their own.
+# In water. Pairs and chains are trained on in no solvent; monomers are tested on runs of their own.
 TEST, FURTHER_TEST = (
-    tuple(Peptide(residues, capped, 16, 3000.0) for residues, capped in some)
+    tuple(Peptide(residues, capped, 16, 1000.0) for residues, capped in some)
     for some in (
-        ((("ALA",), True), (("PHE",), True), (("LEU", "SER"), True), (("VAL", "ASN"), True),
-         (("SER", "LEU", "ALA"), True), (("MET", "SER"), False)),
-        ((("LYS", "GLU"), True), (("PHE", "GLY"), True), (("ALA", "SER", "VAL", "LEU"), True),
-         (("ILE", "GLN", "ALA", "PHE"), False)),
+        ((("LEU", "SER"), True), (("VAL", "ASN"), True), (("MET", "SER"), False)),
+        ((("LYS", "GLU"), True), (("SER", "LEU", "ALA"), True), (("PHE", "GLY"), True), (("ALA",), True),
+         (("PHE",), True), (("ALA", "SER", "VAL", "LEU"), True), (("ILE", "GLN", "ALA", "PHE"), False)),
     )
 )  # fmt: skip
-TRAINING_PS, ROUNDS, DISCARDED_PS = 500.0, 12, 50.0
+TRAINING_PS, ROUNDS = 200.0, 12
+DISCARDED_PS = {"tip3p": 25.0, "obc2": 50.0}
 SAVED_PS = {"tip3p": 1.0, "obc2": 5.0}
 FINE_PS, FINE_SAVED_PS = 300.0, 1.0
 HOT_K, HOT_PS, COOL_PS = 500.0, 100.0, 100.0
@@ -115,8 +115,8 @@ def batch(folder: Path, peptide: Peptide, number: int, solvent: str, every_ps: f
                 quads = rotatable_torsions(dry)
                 starts = starts_in_water(scene, quads, np.asarray(torsion(starts, quads), dtype=np.float64), seed)
         config = MDConfig(
-            force=WATER if in_water else IMPLICIT, time_ps=peptide.time_ps, equilibrate_ps=DISCARDED_PS, seed=seed,
-            platform=SIMD, keep="solute" if in_water else "all", save_every_ps=every_ps,
+            force=WATER if in_water else IMPLICIT, time_ps=peptide.time_ps, equilibrate_ps=DISCARDED_PS[solvent],
+            seed=seed, platform=SIMD, keep="solute" if in_water else "all", save_every_ps=every_ps,
         )  # fmt: skip
         simulate_runs(scene, config, folder, numbers, starts_nm=starts)
 
@@ -131,14 +131,18 @@ def order(solvent: str) -> list[tuple[str, Peptide, int]]:
         kinds = (("test", tests[:FIRST_TESTS]), ("train", train[: len(RESIDUES)]), ("fine", fine),
                  ("train", train[len(RESIDUES) :]), ("test", tests[FIRST_TESTS:]))  # fmt: skip
         return [(kind, p, 0) for kind, some in kinds for p in some]
-    training = [replace(p, time_ps=TRAINING_PS) for p in training_peptides()]
-    first = training[: 2 * len(RESIDUES)]
-    rounds = [(TEST, first), (FURTHER_TEST, training[len(first) :]), *(((), training) for _ in range(ROUNDS - 1))]
+    tests = {p.residues for p in (*unseen_peptides(), *TEST, *FURTHER_TEST) if len(p.residues) > 1}
+    training = [replace(p, time_ps=TRAINING_PS) for p in training_peptides() if p.residues not in tests]
+    monomers, others = training[: len(RESIDUES)], training[len(RESIDUES) :]
+    tested = {residue for peptide in TEST for residue in peptide.residues}
+    # What the first tests are made of comes before them, so that a model of theirs can be trained at once.
+    monomers.sort(key=lambda peptide: peptide.residues[0] not in tested)
+    n, m = len(tested), len(RESIDUES)
+    parts = (("train", monomers[:n]), ("test", TEST), ("train", (*monomers[n:], *others[:m])),
+             ("test", FURTHER_TEST), ("train", others[m:]))  # fmt: skip
     return [
-        (kind, peptide, max(0, k - 1))
-        for k, both in enumerate(rounds)
-        for kind, peptides in zip(("test", "train"), both, strict=True)
-        for peptide in peptides
+        *((kind, peptide, 0) for kind, some in parts for peptide in some),
+        *(("train", peptide, number) for number in range(1, ROUNDS) for peptide in training),
     ]
 
 
