@@ -333,6 +333,7 @@ def rollout(
     outs: Sequence[Path],
     config: RolloutConfig,
     *,
+    starts_nm: npt.NDArray[np.float64] | None = None,
     resume: bool = False,
     overwrite: bool = False,
     progress: ProgressFn | None = None,
@@ -341,6 +342,7 @@ def rollout(
 ) -> list[Path]:
     """Roll a scene forward, one replica per path in `outs`, all in one batch; return the paths.
 
+    Replicas begin at `starts_nm` (n_replicas, n_atoms, 3), without it at the positions of the scene.
     Frames stand at save_every_ps, 2 save_every_ps, ... up to time_ps, in the scene's own atom order and pose, each
     marked with its chunk, its validity flags (systems.chemistry.validity) against the training reference, and what was
     done about it (column `intervention`, `chunks.MARKS`), of which the record holds a summary. Replica k draws
@@ -371,6 +373,13 @@ def rollout(
         precision = "bf16" if checkpoint.read_checkpoint(state_path)[0]["settings"]["bf16"] else "fp32"
     sampler = ChunkSampler(weights, solver_steps=config.solver_steps, solver=config.solver, precision=precision)
     plan = resolve_plan(scene, weights, match, config, sampler, n_replicas=len(outs))
+    if starts_nm is not None:
+        if starts_nm.shape != (len(outs), scene.n_atoms, 3) or not np.isfinite(starts_nm).all():
+            raise InputError(
+                f"`starts_nm` has the shape {starts_nm.shape}, or numbers that are not finite; {len(outs)} replicas of "
+                f"{scene.n_atoms} atoms begin at {(len(outs), scene.n_atoms, 3)}."
+            )
+        plan.settings["starts"] = hashlib.sha256(starts_nm.tobytes()).hexdigest()[:16]
     check_disk(outs[0], plan.n_frames * len(outs), len(plan.kept_atoms))
 
     with ExitStack() as stack:
@@ -380,7 +389,7 @@ def rollout(
             return _already_complete(outs, plan, sampler)
         kept = checkpoint.supported_checkpoint(state_path, outs) if resume and state_path.exists() else None
         if kept is None:
-            state = _start(plan, sampler, len(outs), asked_to_stop)
+            state = _start(plan, sampler, len(outs), asked_to_stop, starts_nm)
         else:
             state = progress_of(state_path, kept, plan.settings)
         header = kept[0] if kept else checkpoint.new_header(len(outs), overwrite=overwrite)
@@ -437,13 +446,16 @@ def rollout(
     return list(outs)
 
 
-def _start(plan: Plan, sampler: ChunkSampler, n_replicas: int, asked_to_stop: Callable[[], bool]) -> Progress:
+def _start(
+    plan: Plan, sampler: ChunkSampler, n_replicas: int, asked_to_stop: Callable[[], bool],
+    starts_nm: npt.NDArray[np.float64] | None,
+) -> Progress:  # fmt: skip
     began = time.monotonic()
-    positions = plan.scene.positions_nm[None]
-    if plan.config.anneal_ps and not plan.match.seen:  # heat turns torsions, and no chair
+    positions = plan.scene.positions_nm[None] if starts_nm is None else starts_nm
+    if plan.config.anneal_ps and not plan.match.seen and starts_nm is None:  # heat turns torsions, and no chair
         positions = ring_conformers(plan.scene)
     starts = (positions - positions.mean(axis=1, keepdims=True)).astype(np.float32)[:, plan.match.order]
-    own = starts[[conformer_of(k, len(starts)) for k in range(n_replicas)]]
+    own = starts if starts_nm is not None else starts[[conformer_of(k, len(starts)) for k in range(n_replicas)]]
     frames = np.repeat(own[:, None], sampler.n_conditioning, axis=1)
     if plan.config.anneal_ps:
         frames = _annealed(plan, sampler, frames, asked_to_stop)

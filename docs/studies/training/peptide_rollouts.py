@@ -41,10 +41,10 @@ def thinned(paths: Sequence[Path], apart_ps: float = FRAMES_PS) -> tuple[Scene, 
 
 def rolled(
     weights: Weights, scene: Scene, outs: Sequence[Path], time_ps: float, lag_ps: float = FRAMES_PS,
-    solvent: str | None = None,
+    solvent: str | None = None, starts_nm: FloatArray | None = None,
 ) -> list[FloatArray]:  # fmt: skip
     """Return the frames of unguarded rollouts, of molecules longer than any in training too; those that are there are
-    read."""
+    read. `starts_nm`: where each begins."""
     from surrogate.sampling.runner import RolloutConfig, rollout
 
     if not all(out.exists() for out in outs):
@@ -54,6 +54,7 @@ def rolled(
             weights,
             outs,
             RolloutConfig(time_ps=time_ps, lag_ps=lag_ps, solvent=solvent, seed=1, guard="off", force=True),
+            starts_nm=starts_nm,
             overwrite=True,
         )
     return [thinned([out], lag_ps)[1][0] for out in outs]

@@ -3,8 +3,8 @@
     python docs/studies/training/peptide_unseen.py FOLDER --weights W --test CAMPAIGN/test [--solvent tip3p]
           [--library CAMPAIGN/train] [--corrected THERE/train HERE/train] [--molecules NAME ...] [-o TABLE.json]
 
-Of each molecule the weights roll as many runs as MD has, of MD's first 10 ns the same, unguarded, at lags of 10 ps,
-100 ps and 1 ns (FOLDER/NAME; what is there is read). Over MD's own:
+Of each molecule the weights roll as many runs as MD has, each from the first frame of one of these, as long as MD's but
+10 ns at most, unguarded, at lags of 10 ps, 100 ps and 1 ns (FOLDER/NAME; what is there is read). Over MD's own:
 - torsions: mean Jensen-Shannon distance (root, natural logarithm, 50 bins) over φ, ψ and χ, of one run to all others'
   MD (single), and of half of the runs to half of MD's (pooled); joint maps of ψ and the next φ (36 x 36) pooled;
 - kinetics: integrated correlation times of every cos ψ and along the two slowest TICA coordinates of MD;
@@ -255,7 +255,7 @@ def molecule(
         return [folder / f"{lag_ps:g}ps-{k:02d}.h5" for k in range(len(runs))]
 
     def roll(lag_ps: float) -> list[FloatArray]:
-        return rolled(weights, scene, files(lag_ps), time_ps, lag_ps, solvent)
+        return rolled(weights, scene, files(lag_ps), time_ps, lag_ps, solvent, np.stack([x[0] for x in md_nm]))
 
     own_nm = roll(FRAMES_PS)
     fitted, _ = fit_weights(scene, weights, lag_ps=FRAMES_PS, force=True, solvent=solvent)

@@ -36,7 +36,7 @@ from surrogate.sampling.chunks import (
 )
 from surrogate.sampling.runner import RolloutConfig, rollout
 from systems.chemistry.validity import CHIRALITY, CLASH, INVALID, limits_from_frames
-from systems.errors import SimulationError
+from systems.errors import InputError, SimulationError
 from systems.scene import Scene
 from systems.trajectory.checkpoint import frames_in
 from systems.trajectory.codec import open_trajectory
@@ -237,6 +237,24 @@ def test_a_rollout_with_interventions_resumes_bit_for_bit(tmp_path: Path, scene:
             assert np.array_equal(whole.marks, resumed.marks) and whole.marks.any()
             for key in ("chunks", "chunks_caught", "frames", "reasons", "draws"):
                 assert whole.summary[key] == resumed.summary[key]
+
+
+def test_replicas_begin_where_they_are_told(tmp_path: Path, scene: Scene, domain: TrainingDomain) -> None:
+    config = RolloutConfig(time_ps=N_NEW * LAG_PS, guard="off", precision="fp32", seed=4)
+
+    def distances(x: np.ndarray) -> np.ndarray:
+        return np.linalg.norm(x[..., :, None, :] - x[..., None, :, :], axis=-1)
+
+    other = scene.positions_nm.copy()
+    other[:, 0] *= 1.2
+    starts = np.stack([scene.positions_nm, other])
+    outs = [tmp_path / f"{k}.h5" for k in range(2)]
+    rollout(scene, weights_of(domain), outs, config, starts_nm=starts)
+    for out, start in zip(outs, starts, strict=True):
+        assert np.abs(distances(Rolled(out).frames[0].astype(np.float64)) - distances(start)).max() < 0.02
+    assert np.abs(distances(other) - distances(scene.positions_nm)).max() > 0.1
+    with pytest.raises(InputError, match=r"begin at \(2, \d+, 3\)"):
+        rollout(scene, weights_of(domain), outs, config, starts_nm=starts[:1], overwrite=True)
 
 
 def test_a_batch_that_memory_does_not_hold_is_halved(tmp_path: Path, scene: Scene, domain: TrainingDomain) -> None:
