@@ -16,6 +16,7 @@ import peptide_runs
 import peptide_seeds
 import peptide_transfer
 import peptide_unseen
+import peptide_water
 import pytest
 from peptide_correction import CELLS, Correction
 from peptide_energies import wham
@@ -228,6 +229,34 @@ def test_the_farthest_state_is_named_with_both_populations() -> None:
     shares = re.fullmatch(r"psi of ALA 1, -180° to 0°: (\d+) ± [01] for (\d+) ± [01] %", found)
     assert shares and abs(int(shares[1]) - 40) <= 2 and abs(int(shares[2]) - 70) <= 2
     assert peptide_unseen.farthest_state(turns, ["ALA"], md, of, [1]).startswith("phi of ALA 1, ")
+
+
+def test_free_energies_of_states_are_compared_in_kt() -> None:
+    turns = [Turn(kind, 0, (0, 1, 2, 3)) for kind in ("phi", "psi")]
+    rng = np.random.default_rng(0)
+
+    def runs(strands: float) -> list[np.ndarray]:
+        where = np.where(rng.random((8, 2000, 2)) < strands, 2.0, -1.0)
+        return list(where + 0.2 * rng.normal(size=where.shape))
+
+    md, of, once = runs(0.5), runs(0.8), all_count(runs(0.5))
+    error, halves = peptide_unseen.free_energy_errors(turns, md, of, [0], [once, once])
+    assert error == pytest.approx(math.hypot(math.log(1.6), math.log(0.4)) / math.sqrt(2), rel=0.05) and halves < 0.1
+    # Each frame in strands counts a quarter of one that is not, and populations are those of MD again.
+    weighed = [np.where(x[:, 1] > 0.5, 0.25, 1.0) for x in of]
+    assert peptide_unseen.free_energy_errors(turns, md, of, [0], [once, weighed])[0] < 0.1
+
+
+def test_means_over_molecules_in_water() -> None:
+    assert ("joint", 16) in peptide_water.tasks((1, 16)) and ("joint", 1) not in peptide_water.tasks((1, 16))
+    rows = [
+        {"torsions, single": [a, 1], "torsions, pooled": [2 * a, 1], "joint maps, pooled": None if a > 1 else [3, 1],
+         "kinetics": {"ψ 1": b, "TICA 0": 9.0}, "free energies of states, kT: error, MD's halves": (a, 0.5)}
+        for a, b in ((1.0, 0.25), (2.0, 1.0))
+    ]  # fmt: skip
+    one, pooled, joint, energies, psi = peptide_water.mean_row(rows)
+    assert (one, pooled, joint) == ("1.50 (2.00)", "3.00 (4.00)", "3.00 (3.00)")
+    assert energies == "1.58 (0.50)" and psi.startswith("0.50 (")
 
 
 def test_no_training_takes_what_is_tested_by(tmp_path: Path) -> None:

@@ -61,6 +61,8 @@ Runs = Sequence[FloatArray]
 RUN_PS, LAGS_PS, BINS, JOINT_BINS, HALVES, SEED = 10_000.0, (100.0, 1000.0), 50, 36, 10, 0
 # By so many steps the pace of MD is measured; it is that of steps of 4 fs, as the runs have.
 PACE_STEPS, TIMESTEP_PS = 5000, 0.004
+# Shares of the time: of a state whose free energy is compared, and what one that was never seen counts as.
+VISITED, LEAST = 0.03, 0.001
 # Columns of the first table; the others make a second one.
 DISTANCES = 7
 
@@ -208,13 +210,34 @@ def kinetics(md: Runs, of: Runs, psi: Sequence[int]) -> dict[str, float]:
     return {name: float(ratio[0]) for name, ratio in ratios.items()}
 
 
-def populations(wells: Sequence[Any], runs: Runs) -> FloatArray:
-    """Return the population of every state of every torsion."""
-    found = []
+def populations(wells: Sequence[Any], runs: Runs, weights: Runs | None = None) -> FloatArray:
+    """Return the population of every state of every torsion, of frames that count `weights`."""
+    found, counted = [], None if weights is None else np.concatenate(weights)
     for k, of in enumerate(wells):
         states = np.concatenate(of.assign([x[:, k] for x in runs]))
-        found += (np.bincount(states, minlength=len(of.names)) / len(states)).tolist()
+        counts = np.bincount(states, counted, len(of.names))
+        found += (counts / counts.sum()).tolist()
     return np.array(found)
+
+
+def free_energy_errors(
+    turns: Sequence[Turn], md: Runs, of: Runs, rare: Sequence[int], counted: Sequence[Runs]
+) -> tuple[float, float]:  # fmt: skip
+    """Return the root mean square error of the free energies of states of torsions that MD visits well, in kT, and how
+    far halves of MD's runs are apart. States of torsions `rare` play no part; frames of both count `counted`."""
+    kept = [k for k in range(len(turns)) if k not in rare]
+    md, of = [x[:, kept] for x in md], [x[:, kept] for x in of]
+    wells = [find_wells([x[:, i] for x in md], fold=turns[k].fold) for i, k in enumerate(kept)]
+    here, there, *halves = (
+        populations(wells, *some) for some in ((md, counted[0]), (of, counted[1]),
+                                               *((md[k::2], counted[0][k::2]) for k in (0, 1)))
+    )  # fmt: skip
+    visited = here > VISITED
+
+    def apart(a: FloatArray, b: FloatArray) -> float:
+        return float(np.sqrt(np.mean(np.log(np.maximum(a, LEAST) / np.maximum(b, LEAST))[visited] ** 2)))
+
+    return apart(there, here), apart(*halves)
 
 
 def lag_errors(md: Runs, at_10: Runs, others: dict[float, Runs]) -> dict[str, float]:
@@ -297,6 +320,8 @@ def molecule(
         "equivalent MD time": worst(runs, files(FRAMES_PS)),
         "MD's own, single": float(single(one[0], one[0]).mean()),
         "farthest state": farthest_state(turns, amino_acids, md, of, rare),
+        "free energies of states, kT: error, MD's halves": free_energy_errors(turns, md, of, rare, counted),
+        "MD of the same wall time, ns": len(md) * md_ps * 1e-3,
         "rare φ > 0": [f"{turns[k].kind} {turns[k].residue}" for k in rare],
         "kinetics": {name: clock * ratio for name, ratio in kinetics(usual, never(of, rare), psi).items()},
         "kinetics of MD's halves": kinetics(usual[::2], usual[1::2], psi),
