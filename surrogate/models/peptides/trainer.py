@@ -172,8 +172,8 @@ class PeptideTraining:
 
     `time_reversal`: windows are read backwards, too, and frames drawn from equilibrium stand for endless times, both
     weighted by a Markov model of each molecule (`models.peptides.subjects`). `positive_phi_kt`: of residue types, the
-    free energy of phi > 0 over phi < 0 in kT, in the first solvent. `tuned`: of weights that training goes on from,
-    'all', the probabilities of 'states' alone, or what is the 'solvent's own (`SOLVENT_PARTS`).
+    free energy of phi > 0 over phi < 0 in kT, which every solvent is taken to have. `tuned`: of weights that training
+    goes on from, 'all', the probabilities of 'states' alone, or what is the 'solvent's own (`SOLVENT_PARTS`).
     """
 
     budget_s: float | None = None
@@ -226,10 +226,7 @@ def train_peptides(
         _go_on_from(cast(PeptideSlide, start.model), model)
     _fill_unseen(model, subjects)
     if training.time_reversal:
-        subjects = [
-            subject.in_equilibrium(training.positive_phi_kt if int(subject.chain.places[0, 3]) == 0 else {})
-            for subject in subjects
-        ]
+        subjects = [subject.in_equilibrium(training.positive_phi_kt) for subject in subjects]
     of_jumps = 1.0 if training.tuned == "states" else JUMPS_SHARE
     for name, p in model.named_parameters():
         p.requires_grad_(training.tuned != "solvent" or name in SOLVENT_PARTS)
@@ -239,6 +236,8 @@ def train_peptides(
     shared = StageConfig(
         "flow", training.batch, training.learning_rate, flow_s, training.steps, seed=training.seed,
         bf16=training.bf16, validate_every_s=training.validate_every_s,
+        # Decay would move what other solvents have of their own.
+        weight_decay=0.0 if training.tuned == "solvent" else StageConfig.weight_decay,
     )  # fmt: skip
     stages = (shared, replace(shared, name="jumps", batch=_JUMPS_BATCH, budget_s=jumps_s, bf16=False))
     n_held = min(_HELD_WINDOWS, max(_LEAST_HELD, _HELD_IN_ALL // (len(subjects) + len(held_out))))
@@ -283,7 +282,8 @@ def train_peptides(
                 found.setdefault(f"{name}_{key}", []).append(float(value))
         return {key: float(np.mean(values)) for key, values in found.items()}
 
-    domain = peptides_domain(sets, config)
+    # What only a solvent's own parts were trained for says nothing of the others, and takes nothing from them.
+    domain = peptides_domain(sets, config, start.domain if start is not None and training.tuned == "solvent" else None)
 
     def write(spent_s: list[float]) -> None:
         settings: dict[str, Any] = {"seed": training.seed, "spent_s": round(sum(spent_s), 1)}
@@ -311,21 +311,26 @@ def long_enough(subjects: Sequence[PeptideSubject], config: PeptideConfig) -> li
     return [subject for subject in subjects if held(subject) > config.chunk_frames] or list(subjects)
 
 
-def peptides_domain(sets: Sequence[TrainingFrames], config: PeptideConfig) -> TrainingDomain:
+def peptides_domain(
+    sets: Sequence[TrainingFrames], config: PeptideConfig, start: TrainingDomain | None = None
+) -> TrainingDomain:
     """Return the domain of weights for peptides: of each solvent the smallest molecules, whose own frames say what is
-    valid, and the names of all others."""
+    valid, and the names of all others; in solvents that `sets` do not show, what weights gone on from cover."""
     smallest: dict[str, dict[str, TrainingFrames]] = {}
     for frames in sorted(sets, key=lambda frames: (frames.scene.n_atoms, frames.lag_ps)):
         of_solvent = smallest.setdefault(str(frames.conditions.get("solvent")), {})
         of_solvent.setdefault("-".join(frames.scene.residue_names), frames)
+    # One molecule says nothing of others, whatever the weights covered that it was trained from.
+    several = len({f.scene.topology_hash for f in sets}) > 1
     found: list[TrainingDomain] = []
     for solvent in config.solvents or smallest:
         some = smallest.get(solvent, {})
         kept = list(map(id, list(some.values())[:_WHOLE]))
         whole = [training_domain(f, strides=_strides(config, f)) for f in sets if id(f) in kept]
         found += [replace(one, sequences=tuple(some)[_WHOLE:] if one is whole[0] else ()) for one in whole]
-    # One molecule says nothing of others, whatever the weights covered that it was trained from.
-    several = len({f.scene.topology_hash for f in sets}) > 1
+        if not some and start is not None and start.transferable == several:
+            members = (replace(member, further=()) for member in start.members)
+            found += (member for member in members if str(member.conditions.get("solvent")) == solvent)
     return replace(found[0], further=tuple(found[1:]), transferable=several)
 
 

@@ -418,6 +418,10 @@ def test_weights_of_two_solvents_know_which_is_meant(frames: TrainingFrames, tmp
     }  # fmt: skip
     assert moved["solvent"] <= set(SOLVENT_PARTS) < moved["all"] | set(SOLVENT_PARTS)
     assert all(bool(model.get_parameter(name)[-1].any()) for name in SOLVENT_PARTS[:2])
+    change, was = model.jumps.of_change, first.model.jumps.of_change
+    assert torch.equal(change[:, :n], was) and not torch.equal(change[:, n:], was)
+    covered = {tuned: [m.conditions["solvent"] for m in one.domain.members] for tuned, one in found.items()}
+    assert covered == {"solvent": ["obc2", "tip3p"], "all": ["tip3p"]}
     # Residue types that are not in the water data have there what they have elsewhere.
     ala, gone = (n + (*ENDS, *model.config.types).index(name) for name in ("ALA", "NME"))
     assert float((model.token_scale[ala] / model.token_scale[ala - n]).median()) > 1.5
