@@ -4,7 +4,8 @@
           [--library CAMPAIGN/train] [--corrected THERE/train HERE/train] [--molecules NAME ...] [-o TABLE.json]
 
 Of each molecule the weights roll as many runs as MD has, each from the first frame of one of these, as long as MD's but
-10 ns at most, unguarded, at lags of 10 ps, 100 ps and 1 ns (FOLDER/NAME; what is there is read). Over MD's own:
+10 ns at most, unguarded, at lags of 10 ps, 100 ps and 1 ns as far as training had them (FOLDER/NAME; what is there is
+read). Over MD's own:
 - torsions: mean Jensen-Shannon distance (root, natural logarithm, 50 bins) over φ, ψ and χ, of one run to all others'
   MD (single), and of half of the runs to half of MD's (pooled); joint maps of ψ and the next φ (36 x 36) pooled;
 - kinetics: integrated correlation times of every cos ψ and along the two slowest TICA coordinates of MD;
@@ -50,7 +51,7 @@ from surrogate.comparison.rows.published_metrics import TABLE, fit_recipe, pepti
 from surrogate.models.architecture import weights_path
 from surrogate.models.peptides.chains import POSITIVE_PHI_DEG
 from surrogate.models.weights import Weights, load_weights
-from surrogate.sampling.domain import fit_weights
+from surrogate.sampling.domain import fit_weights, under_conditions
 from systems.chemistry.validity import INVALID, Geometry, check_frames
 from systems.scene import Scene
 from systems.trajectory.codec import open_trajectory
@@ -281,6 +282,8 @@ def molecule(
         return rolled(weights, scene, files(lag_ps), time_ps, lag_ps, solvent, np.stack([x[0] for x in md_nm]))
 
     own_nm = roll(FRAMES_PS)
+    longest_ps = under_conditions(weights, {"solvent": solvent}).domain.longest_lag_ps
+    lags = [lag for lag in LAGS_PS if lag <= min(time_ps / 2, longest_ps)]
     fitted, _ = fit_weights(scene, weights, lag_ps=FRAMES_PS, force=True, solvent=solvent)
     geometry = Geometry.from_dict(fitted.domain.geometry)
     valid = [100.0 * float(np.mean([((check_frames(x, geometry) & INVALID) == 0).mean() for x in some]))
@@ -326,7 +329,7 @@ def molecule(
         "kinetics": {name: clock * ratio for name, ratio in kinetics(usual, never(of, rare), psi).items()},
         "kinetics of MD's halves": kinetics(usual[::2], usual[1::2], psi),
         "MDGen's recipe": published(scene, md_nm, own_nm) if len(psi) == 3 and len(amino_acids) == 4 else None,
-        "lags": lag_errors(md, of, {lag: [angles(turns, x) for x in roll(lag)] for lag in LAGS_PS}),
+        "lags": lag_errors(md, of, {lag: [angles(turns, x) for x in roll(lag)] for lag in lags}),
         "valid, %: MD, model": valid,
     }
 
@@ -343,10 +346,11 @@ def summary(rows: dict[str, dict[str, Any]]) -> list[str]:
         off = np.exp(np.abs(np.log(ratios)))
         lines.append(f"{what}: {100 * np.mean(off < 1.4):.0f} % of {len(off)} within 1.4, at most {off.max():.1f} off")
     for lag in LAGS_PS:
-        found = [row["lags"][f"{lag:g} ps"] for row in rows.values()]
-        lines.append(
-            f"populations at {lag:g} ps: {np.mean(found):.2f} of what MD's halves differ, at most {max(found):.2f}"
-        )
+        found = [row["lags"][f"{lag:g} ps"] for row in rows.values() if f"{lag:g} ps" in row["lags"]]
+        if found:
+            lines.append(
+                f"populations at {lag:g} ps: {np.mean(found):.2f} of what MD's halves differ, at most {max(found):.2f}"
+            )
     found = [row["equivalent MD time"][0] for row in rows.values()]
     lines.append(f"equivalent MD time by the worst measure: median {np.nanmedian(found):.3g} ns")
     tables = [row["MDGen's recipe"] for row in rows.values() if row["MDGen's recipe"]]
