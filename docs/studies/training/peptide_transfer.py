@@ -16,14 +16,16 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from peptide_energies import known_energies
 from peptide_list import RESIDUES, held_out_peptides, unseen_peptides
 from processes import is_trained
 
-from surrogate.data import TrainingFrames, collect_frames
+from surrogate.data import Split, TrainingFrames, collect_frames
 from surrogate.models.architecture import weights_path
 from surrogate.models.peptides.layout import PeptideConfig
 from surrogate.models.peptides.trainer import TUNED, PeptideTraining, train_peptides
@@ -32,6 +34,8 @@ from systems.errors import InputError
 from systems.units import parse_wall_s
 
 _VALIDATE_S = 300.0
+# The end of each run that is held out has at least so many frames, more than a chunk.
+_HELD_FRAMES = 20
 
 
 def sets_of(folders: Sequence[Path], runs: int) -> list[TrainingFrames]:
@@ -43,7 +47,9 @@ def sets_of(folders: Sequence[Path], runs: int) -> list[TrainingFrames]:
         if place.name.removeprefix("free-") in tested:
             raise InputError(f"{place}: weights are tested on these residues; leave it out of training.")
         if files := sorted(place.glob("run_*.h5"))[:runs]:
-            found.append(collect_frames(files))
+            frames = collect_frames(files)
+            share = max(Split.share, _HELD_FRAMES / int(np.diff(frames.starts).min()))
+            found.append(replace(frames, split=Split(share)))
     if not found:
         raise InputError(f"{', '.join(map(str, folders))} hold no runs.")
     return found

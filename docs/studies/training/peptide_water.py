@@ -107,9 +107,9 @@ def make_table(folder: Path, water: Path, obc2: Path, start: str, out: Path) -> 
         found[f"{method}-{n}"] = rows
         (folder / "rows.json").write_text(json.dumps(found, indent=1, ensure_ascii=False), "utf-8")
         ns = simulated_ns(water / "train", n) if n else 0.0
-        equivalent = [row["equivalent MD time"][0] for row in rows.values()]
+        equivalent = [ns for row in rows.values() if math.isfinite(ns := row["equivalent MD time"][0])]
         lines.append([WORDS[method], f"{ns:.0f}", *mean_row(list(rows.values())),
-                      "-" if corrected else f"{np.nanmedian(equivalent):.2g}"])  # fmt: skip
+                      f"{np.median(equivalent):.2g}" if equivalent and not corrected else "-"])  # fmt: skip
         sys.stdout.write(" | ".join(lines[-1]) + "\n")
         sys.stdout.flush()
     table = {
