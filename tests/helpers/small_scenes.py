@@ -73,12 +73,12 @@ def beyond(scene: Scene, start: int, end: int) -> list[int]:
     return sorted(nx.node_connected_component(graph, end))
 
 
-def with_phi_turned(scene: Scene) -> np.ndarray:
-    """Every phi turned by half a circle: strands become left-handed."""
+def with_phi_turned(scene: Scene, kind: str = "phi") -> np.ndarray:
+    """Every phi turned by half a circle: strands become left-handed; or every torsion of another kind."""
     from systems.chemistry.graph import backbone_torsions
 
     positions = scene.positions_nm
-    for _, start, end, _ in backbone_torsions(scene)["phi"].tolist():
+    for _, start, end, _ in backbone_torsions(scene)[kind].tolist():
         positions = rotated(positions, beyond(scene, start, end), (start, end), np.pi)
     return positions
 

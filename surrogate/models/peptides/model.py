@@ -157,12 +157,11 @@ class StateJumps(nn.Module):
         return (self.logits(F.silu(self.hidden(h))) + level).scatter(-1, now[..., None], 0.0)
 
     @torch.no_grad()
-    def raise_entries(self, of_type: Tensor, before: Tensor, after: Tensor) -> None:
-        """Add levels `(n_types * n_solvents,)` to the logits of entering phi > 0, of the residue's type and of its
-        neighbours'."""
-        self.of_change[0, :, 0, 0, 1] += of_type
-        self.beside_change[0, :, 0, 0, 1] += before / _FAST
-        self.beside_change[1, :, 0, 0, 1] += after / _FAST
+    def raise_change(self, torsion: int, start: int, end: int, levels: Tensor) -> None:
+        """Add `levels` (3, n_types * n_solvents) to the logits of one change, of the residue's kind, of that before and
+        of that after."""
+        self.of_change[0, :, torsion, start, end] += levels[0]
+        self.beside_change[:, :, torsion, start, end] += levels[1:] / _FAST
 
     def loss(
         self, observed: Tensor, states: Tensor, places: Tensor, counts: Tensor, times_ps: Tensor, apart_ps: Tensor,
@@ -194,10 +193,11 @@ class StateJumps(nn.Module):
 
     def draw(
         self, observed: Tensor, states: Tensor, places: Tensor, counts: Tensor, times_ps: Tensor, apart_ps: Tensor,
-        uniform: Tensor,
+        uniform: Tensor, shares: Tensor | None = None,
     ) -> Tensor:  # fmt: skip
         """Return states `(b, t, r, MOST_TORSIONS)` of new frames, from the given frame's numbers and `states`
-        (b, r, MOST_TORSIONS) and numbers `uniform` (b, t, r, MOST_TORSIONS) in [0, 1)."""
+        (b, r, MOST_TORSIONS) and numbers `uniform` (b, t, r, MOST_TORSIONS) in [0, 1). Their probabilities are written
+        to `shares` (b, t, r, MOST_TORSIONS, MOST_STATES)."""
         with torch.autocast(observed.device.type, enabled=False):
             of_times, levels = self.of_times_alone(times_ps, apart_ps, places, counts)
             common = self.of_observed(observed, states, places, counts)[:, None] + of_times[:, :, None]
@@ -217,7 +217,10 @@ class StateJumps(nn.Module):
                         logits = self.probabilities(
                             torsion, seen, levels[:, at, :, part], now[..., part, torsion], conditioning[..., part, :]
                         )
-                        share = logits.softmax(-1).cumsum(-1)
+                        share = logits.softmax(-1)
+                        if shares is not None:
+                            shares[:, at, part, torsion] = share
+                        share = share.cumsum(-1)
                         # Shares may end below one by rounding.
                         drawn = (uniform[:, at, part, torsion, None] >= share[..., :-1]).sum(-1)
                         new[..., part, torsion] = drawn.minimum(most[part, torsion])

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from types import EllipsisType
-from typing import Any, NamedTuple, cast
+from typing import Any, cast
 
 import numpy as np
 import torch
@@ -19,13 +18,13 @@ from surrogate.models import architecture as arch
 from surrogate.models.lam_slide import flow
 from surrogate.models.lam_slide.trainer import REVERSIBLE, TAU_MAX, pick
 from surrogate.models.peptides import chains
+from surrogate.models.peptides.balance import balance
 from surrogate.models.peptides.layout import (
     ENDS,
     PeptideConfig,
     chain_features,
     chain_layout,
     chain_scale,
-    kinds_of,
     standard_peptide,
     unknown_coordinates,
 )
@@ -42,109 +41,6 @@ from surrogate.models.weights import (
 )
 from surrogate.training.loop import ProgressFn, Stage, StageConfig, train_stages
 from systems.errors import InputError
-
-# Runs from chosen starts show hundreds of exits from phi > 0 and hardly an entry, and a rate that is three times too
-# high shows in no loss. So after training the probabilities of entering are moved, by a level of each residue's type
-# and of its neighbours', to where as many frames enter as leave in the mean over all training peptides, given the
-# probabilities of leaving and the free energy of phi > 0 (umbrella sampling).
-
-# Frames of either side at which probabilities are read, drawn anew by this seed, and how long after them.
-_SIDE_FRAMES, _SIDE_SEED = 1000, 0
-_TIMES_PS = (3.0, 10.0, 30.0, 100.0)
-# Of a side that fewer frames show, nothing is said.
-_LEAST_FRAMES = 50
-_PASSES = 4
-# Holds levels that few peptides show near zero, and what one phi may ask for within bounds.
-_RIDGE, _MOST = 0.3, 3.0
-
-
-class Phi(NamedTuple):
-    """One phi of a peptide: its `residue`; frames well on its negative and on its positive side, `observed` (n,
-    n_residues, n_slots) and `states` (n, n_residues, MOST_TORSIONS) of each; and how likely `positive` is beside the
-    other."""
-
-    chain: chains.ChainFeatures
-    residue: int
-    observed: tuple[Tensor, ...]
-    states: tuple[Tensor, ...]
-    positive: float
-
-
-@torch.no_grad()
-def balance_entries(model: PeptideSlide, subjects: Sequence[PeptideSubject]) -> None:
-    """Move the probabilities of entering phi > 0 of `model` to where detailed balance holds in the mean over
-    `subjects`, whose weights say how likely phi > 0 is; those without weights play no part."""
-    phis = [phi for subject in subjects for phi in weighted_phis(model, subject)]
-    if not phis:
-        return
-    # Of each phi the kinds of its residue, of the one before and of the one after.
-    types = torch.zeros(len(phis), 3, len(model.token_mean), dtype=torch.float64)
-    for of_phi, phi in zip(types, phis, strict=True):
-        of_phi[range(3), kinds_of(phi.chain.places, model.config.n_types)[phi.residue].cpu()] = 1.0
-    types = types.flatten(1)
-    held = types.T @ types + _RIDGE * torch.eye(types.shape[1], dtype=torch.float64)
-    for _ in range(_PASSES):
-        lacking = torch.tensor([lacking_entries(model, phi) for phi in phis], dtype=torch.float64)
-        levels = torch.linalg.solve(held, types.T @ lacking.clamp(-_MOST, _MOST))
-        model.jumps.raise_entries(*levels.float().to(model.token_mean.device).chunk(3))
-
-
-def weighted_phis(model: PeptideSlide, subject: PeptideSubject) -> list[Phi]:
-    """Return each phi of a peptide of which frames show both sides and weights say how likely they are; none before a
-    proline."""
-    found: list[Phi] = []
-    for residue in subject.chain.signed if subject.weights is not None else ():
-        sides = [_side(subject, residue, state) for state in (0, 1)]
-        if min(len(idx) for idx, _ in sides) >= _LEAST_FRAMES:
-            observed, states = zip(*(subject.seen(model, idx) for idx, _ in sides), strict=True)
-            found.append(Phi(subject.chain, residue, observed, states, sides[1][1] / sides[0][1]))
-    return found
-
-
-def lacking_entries(model: PeptideSlide, phi: Phi) -> float:
-    """Return the logarithm of how many times too low the probabilities of entering phi > 0 are, in the mean over
-    times."""
-    enter, leave = (_log_probabilities(model, phi, state) for state in (0, 1))
-    return float((leave - enter).mean()) + math.log(phi.positive)
-
-
-def _side(subject: PeptideSubject, residue: int, state: int) -> tuple[Tensor, float]:
-    """Return frames well on one side of a phi, and how likely this side is. Of the rare side all frames count alike:
-    the weights within it rest on few."""
-    assert subject.weights is not None
-    idx = torch.arange(len(subject.weights))
-    weights = torch.from_numpy(subject.weights) * (subject.states(idx)[:, residue, 0] == state)
-    total = float(weights.sum())
-    if total == 0.0:
-        return idx[:0], total
-    generator = torch.Generator().manual_seed(_SIDE_SEED)
-    drawn = torch.multinomial(
-        weights if state == 0 else (weights > 0).double(), _SIDE_FRAMES, True, generator=generator
-    )
-    stated = subject.chain.stated.to(torch.device("cpu"))
-    quad = stated.quads[(stated.residue == residue) & (stated.slot == 0)][0]
-    x = torch.from_numpy(subject.frames.positions_nm(drawn.numpy()))
-    phi = chains.dihedral(*(x[:, int(atom)] for atom in quad)).rad2deg()
-    low, high = (chains.NEGATIVE_CORE_DEG, chains.POSITIVE_CORE_DEG)[state]
-    return drawn[(phi > low) & (phi < high)], total
-
-
-def _log_probabilities(model: PeptideSlide, phi: Phi, state: int) -> Tensor:
-    """Return the logarithm of how likely, in the mean over frames of one side, a phi is on the other `_TIMES_PS`
-    later."""
-    observed, now, chain = phi.observed[state], phi.states[state], phi.chain
-    counts, before, found = chain.stated.counts, now[:, None], []
-    conditioning = chains.conditioning_states(before, counts)
-    common = model.jumps.of_observed(observed, now, chain.places, counts)[:, None]
-    common = common + model.jumps.of_frames(conditioning, conditioning) + model.jumps.of_new_states(conditioning)
-    for time_ps in _TIMES_PS:
-        times = torch.full((len(observed), 1), time_ps, device=observed.device)
-        apart = times_apart(times, model.config.forgotten_ps)
-        of_times, levels = model.jumps.of_times_alone(times, apart, chain.places, counts)
-        logits = model.jumps.probabilities(0, common + of_times[:, :, None], levels, before[..., 0], conditioning)
-        found.append(logits.softmax(-1)[:, 0, phi.residue, 1 - state].double().mean().log())
-    return torch.stack(found)
-
 
 _MEASURED_FRAMES = 4000
 _MEASURED_PAIRS = 4000
@@ -295,7 +191,7 @@ def train_peptides(
         for stage, trained, loss_fn in zip(stages, (model.flow, model.jumps), (flow_loss, jumps_loss), strict=True):
             if stage.name == "jumps" or training.tuned != "states":
                 yield Stage(trained, stage, loss_fn, partial(validate, stage))
-        balance_entries(model, subjects)
+        balance(model, subjects)
 
     train_stages(in_turn(), out, write, device=device, resume=resume, progress=progress)
     return out

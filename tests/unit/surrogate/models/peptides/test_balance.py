@@ -1,6 +1,8 @@
-"""Probabilities of entering phi > 0 after balancing: as many frames enter as leave."""
+"""Probabilities of changes of states after balancing: as many frames go one way as the other."""
 
 from __future__ import annotations
+
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -8,20 +10,21 @@ import torch
 
 from small_scenes import with_phi_turned
 from surrogate.data import TrainingFrames, canonicalise, quantise
+from surrogate.models.peptides.balance import balance, changes, lacking_entries, weighted_phis
 from surrogate.models.peptides.layout import PeptideConfig, chain_features
 from surrogate.models.peptides.model import PeptideSlide
 from surrogate.models.peptides.subjects import PeptideSubject
-from surrogate.models.peptides.trainer import balance_entries, lacking_entries, weighted_phis, with_scale
+from surrogate.models.peptides.trainer import with_scale
 from systems.prepare.peptide import build_peptide
 
 SHARE = 0.02
 EACH = 400
 
 
-def _frames(sequence: str) -> TrainingFrames:
-    """As many frames on either side of the first residue's phi as on the other, trembling."""
+def _frames(sequence: str, kind: str = "phi") -> TrainingFrames:
+    """As many frames on either side of the residues' phi, or another torsion, as on the other, trembling."""
     scene = build_peptide(sequence)
-    sides = np.stack([scene.positions_nm, with_phi_turned(scene)]).repeat(EACH, axis=0)
+    sides = np.stack([scene.positions_nm, with_phi_turned(scene, kind)]).repeat(EACH, axis=0)
     sides = sides + 0.002 * np.random.default_rng(0).normal(size=sides.shape)
     return TrainingFrames(scene, quantise(canonicalise(sides, scene)), np.array([0, EACH, 2 * EACH]), 1.0, True, {}, ())
 
@@ -43,10 +46,29 @@ def test_as_many_frames_enter_as_leave() -> None:
     before = [lacking_entries(model, phi) for subject in subjects for phi in weighted_phis(model, subject)]
     assert len(before) == 6 and max(map(abs, before)) > 2.0
     leaving = model.jumps.of_change[:, :, :, 1].clone()
-    balance_entries(model, subjects)
+    balance(model, subjects)
     after = [lacking_entries(model, phi) for subject in subjects for phi in weighted_phis(model, subject)]
     assert max(map(abs, after)) < 0.35
     assert torch.equal(model.jumps.of_change[:, :, :, 1], leaving), "the probabilities of leaving are what they were"
+
+
+def test_as_many_frames_change_one_way_as_the_other() -> None:
+    sets = [_frames(f"ACE-{name}-NME", kind="psi") for name in ("ALA", "SER", "ALA-SER", "SER-ALA")]
+    config = with_scale(PeptideConfig(width=16, n_layers=1, n_heads=1, chunk_frames=4), sets)
+    subjects = [replace(_subject(frames, config), weights=np.repeat([1.6, 0.4], EACH)) for frames in sets]
+    torch.manual_seed(0)
+    model = PeptideSlide(config).requires_grad_(False)
+    model.jumps.of_change[0, :, 1].normal_()
+    before = [change for subject in subjects for change in changes(model, subject) if change.torsion == 1]
+    assert len(before) >= 4 and max(abs(change.lacking) for change in before) > 1.0
+    stay = model.jumps.of_change[0, :, 1].clone()
+    balance(model, subjects)
+    after = [change for subject in subjects for change in changes(model, subject) if change.torsion == 1]
+    worst = [max(abs(change.lacking) for change in some) for some in (before, after)]
+    assert worst[1] < 0.5 * worst[0] and not torch.equal(model.jumps.of_change[0, :, 1], stay)
+    # Both ways share what is lacking.
+    moved = model.jumps.of_change[0, :, 1] - stay
+    torch.testing.assert_close(moved[:, 0, 1], -moved[:, 1, 0])
 
 
 def test_how_likely_the_rare_side_is_sets_the_probabilities() -> None:
@@ -75,5 +97,5 @@ def test_a_side_without_frames_or_weights_says_nothing() -> None:
     alone = PeptideSubject(frames, chain_features(frames.scene, config))
     assert weighted_phis(model, one_sided) == [] and weighted_phis(model, alone) == []
     kept = {name: tensor.clone() for name, tensor in model.state_dict().items()}
-    balance_entries(model, [one_sided, alone])
+    balance(model, [one_sided, alone])
     assert all(torch.equal(tensor, kept[name]) for name, tensor in model.state_dict().items())

@@ -1,0 +1,175 @@
+"""Detailed balance of the probabilities that torsions change their states, set after training."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from itertools import combinations
+from typing import NamedTuple
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from surrogate.models.peptides import chains
+from surrogate.models.peptides.layout import kinds_of
+from surrogate.models.peptides.model import PeptideSlide, times_apart
+from surrogate.models.peptides.subjects import PeptideSubject
+
+# Log-likelihood hardly minds a rate that is wrong by a third, and populations do. So after training the levels of a
+# residue's type and of its neighbours' are moved, for every torsion and both directions of every change alike, to where
+# as many frames of equilibrium go one way as the other in the mean over training peptides.
+#
+# Runs from chosen starts show hundreds of exits from phi > 0 and hardly an entry, and a rate that is three times too
+# high shows in no loss. There the probabilities of entering alone are moved, given those of leaving and the free energy
+# of phi > 0 (umbrella sampling).
+
+# Frames of either side at which probabilities are read, drawn anew by this seed, and how long after them.
+_SIDE_FRAMES, _SIDE_SEED = 1000, 0
+_TIMES_PS = (3.0, 10.0, 30.0, 100.0)
+# Of a side that fewer frames show, nothing is said.
+_LEAST_FRAMES = 50
+_PASSES = 4
+# Holds levels that few peptides show near zero, and what one torsion may ask for within bounds.
+_RIDGE, _MOST = 0.3, 3.0
+# Of changes between other states: frames of equilibrium by which they are counted, how long after them, how often, and
+# what holds levels near zero.
+_FRAMES, _CHANGES_PS, _CHANGES_PASSES, _CHANGES_RIDGE = 2000, (10.0, 100.0), 2, 3.0
+
+
+class Phi(NamedTuple):
+    """One phi of a peptide: its `residue`; frames well on its negative and on its positive side, `observed` (n,
+    n_residues, n_slots) and `states` (n, n_residues, MOST_TORSIONS) of each; and how likely `positive` is beside the
+    other."""
+
+    chain: chains.ChainFeatures
+    residue: int
+    observed: tuple[Tensor, ...]
+    states: tuple[Tensor, ...]
+    positive: float
+
+
+class Change(NamedTuple):
+    """Two states of one torsion of a residue: the `kinds` of the residue and of those beside it, which `torsion`, both
+    states, and the logarithm of how many more frames go back from the second than to it."""
+
+    kinds: tuple[int, int, int]
+    torsion: int
+    states: tuple[int, int]
+    lacking: float
+
+
+@torch.no_grad()
+def balance(model: PeptideSlide, subjects: Sequence[PeptideSubject]) -> None:
+    """Move the probabilities of changes of `model` to where detailed balance holds in the mean over `subjects`, whose
+    weights say how likely states are; those without weights play no part."""
+    for _ in range(_CHANGES_PASSES):
+        found: dict[tuple[int, int, int], list[Change]] = {}
+        for change in (change for subject in subjects for change in changes(model, subject)):
+            found.setdefault((change.torsion, *change.states), []).append(change)
+        for (torsion, a, b), some in found.items():
+            levels = _levels(model, [c.kinds for c in some], [c.lacking for c in some], _CHANGES_RIDGE) / 2
+            model.jumps.raise_change(torsion, a, b, levels)
+            model.jumps.raise_change(torsion, b, a, -levels)
+    phis = [phi for subject in subjects for phi in weighted_phis(model, subject)]
+    kinds = [kinds_of(phi.chain.places, model.config.n_types)[phi.residue].tolist() for phi in phis]
+    for _ in range(_PASSES if phis else 0):
+        model.jumps.raise_change(0, 0, 1, _levels(model, kinds, [lacking_entries(model, phi) for phi in phis], _RIDGE))
+
+
+def _levels(
+    model: PeptideSlide, kinds: Sequence[Sequence[int]], lacking: Sequence[float], ridge: float
+) -> Tensor:  # fmt: skip
+    """Return levels `(3, n_kinds)` of residues, of those before and of those after, whose sums come nearest to what is
+    `lacking` where residues have these `kinds` (n, 3)."""
+    types = torch.zeros(len(kinds), 3, len(model.token_mean), dtype=torch.float64)
+    for of_one, some in zip(types, kinds, strict=True):
+        of_one[range(3), list(some)] = 1.0
+    types = types.flatten(1)
+    held = types.T @ types + ridge * torch.eye(types.shape[1], dtype=torch.float64)
+    found = torch.linalg.solve(held, types.T @ torch.tensor(lacking, dtype=torch.float64).clamp(-_MOST, _MOST))
+    return found.reshape(3, -1).float().to(model.token_mean.device)
+
+
+@torch.no_grad()
+def changes(model: PeptideSlide, subject: PeptideSubject) -> list[Change]:
+    """Return every two states of a peptide's torsions that enough frames of equilibrium show, but the signs of phi."""
+    if subject.weights is None:
+        return []
+    chain, counts = subject.chain, subject.chain.stated.counts
+    generator = torch.Generator().manual_seed(_SIDE_SEED)
+    idx = torch.multinomial(torch.from_numpy(subject.weights), _FRAMES, True, generator=generator)
+    observed, now = subject.seen(model, idx)
+    is_now = F.one_hot(now.long(), chains.MOST_STATES).float()
+    logs = []
+    for time_ps in _CHANGES_PS:
+        times = torch.full((_FRAMES, 1), time_ps, device=observed.device)
+        uniform = torch.rand(_FRAMES, 1, *counts.shape, generator=generator).to(observed.device)
+        shares = torch.zeros(*uniform.shape, chains.MOST_STATES, device=observed.device)
+        apart = times_apart(times, model.config.forgotten_ps)
+        model.jumps.draw(observed, now, chain.places, counts, times, apart, uniform, shares)
+        logs.append(torch.einsum("nrka,nrkb->rkab", is_now, shares[:, 0]).clamp(min=1e-6).log())
+    flux, held = torch.stack(logs).mean(0), is_now.sum(0)
+    kinds = kinds_of(chain.places, model.config.n_types).tolist()
+    return [
+        Change((*kinds[r],), k, (a, b), float(flux[r, k, b, a] - flux[r, k, a, b]))
+        for r, k in torch.nonzero(counts > 1).tolist() if k or r not in chain.signed
+        for a, b in combinations(range(int(counts[r, k])), 2) if min(held[r, k, a], held[r, k, b]) >= _LEAST_FRAMES
+    ]  # fmt: skip
+
+
+def weighted_phis(model: PeptideSlide, subject: PeptideSubject) -> list[Phi]:
+    """Return each phi of a peptide of which frames show both sides and weights say how likely they are; none before a
+    proline."""
+    found: list[Phi] = []
+    for residue in subject.chain.signed if subject.weights is not None else ():
+        sides = [_side(subject, residue, state) for state in (0, 1)]
+        if min(len(idx) for idx, _ in sides) >= _LEAST_FRAMES:
+            observed, states = zip(*(subject.seen(model, idx) for idx, _ in sides), strict=True)
+            found.append(Phi(subject.chain, residue, observed, states, sides[1][1] / sides[0][1]))
+    return found
+
+
+def lacking_entries(model: PeptideSlide, phi: Phi) -> float:
+    """Return the logarithm of how many times too low the probabilities of entering phi > 0 are, in the mean over
+    times."""
+    enter, leave = (_log_probabilities(model, phi, state) for state in (0, 1))
+    return float((leave - enter).mean()) + math.log(phi.positive)
+
+
+def _side(subject: PeptideSubject, residue: int, state: int) -> tuple[Tensor, float]:
+    """Return frames well on one side of a phi, and how likely this side is. Of the rare side all frames count alike:
+    the weights within it rest on few."""
+    assert subject.weights is not None
+    idx = torch.arange(len(subject.weights))
+    weights = torch.from_numpy(subject.weights) * (subject.states(idx)[:, residue, 0] == state)
+    total = float(weights.sum())
+    if total == 0.0:
+        return idx[:0], total
+    generator = torch.Generator().manual_seed(_SIDE_SEED)
+    drawn = torch.multinomial(
+        weights if state == 0 else (weights > 0).double(), _SIDE_FRAMES, True, generator=generator
+    )
+    stated = subject.chain.stated.to(torch.device("cpu"))
+    quad = stated.quads[(stated.residue == residue) & (stated.slot == 0)][0]
+    x = torch.from_numpy(subject.frames.positions_nm(drawn.numpy()))
+    phi = chains.dihedral(*(x[:, int(atom)] for atom in quad)).rad2deg()
+    low, high = (chains.NEGATIVE_CORE_DEG, chains.POSITIVE_CORE_DEG)[state]
+    return drawn[(phi > low) & (phi < high)], total
+
+
+def _log_probabilities(model: PeptideSlide, phi: Phi, state: int) -> Tensor:
+    """Return the logarithm of how likely, in the mean over frames of one side, a phi is on the other `_TIMES_PS`
+    later."""
+    observed, now, chain = phi.observed[state], phi.states[state], phi.chain
+    counts, before, found = chain.stated.counts, now[:, None], []
+    conditioning = chains.conditioning_states(before, counts)
+    common = model.jumps.of_observed(observed, now, chain.places, counts)[:, None]
+    common = common + model.jumps.of_frames(conditioning, conditioning) + model.jumps.of_new_states(conditioning)
+    for time_ps in _TIMES_PS:
+        times = torch.full((len(observed), 1), time_ps, device=observed.device)
+        apart = times_apart(times, model.config.forgotten_ps)
+        of_times, levels = model.jumps.of_times_alone(times, apart, chain.places, counts)
+        logits = model.jumps.probabilities(0, common + of_times[:, :, None], levels, before[..., 0], conditioning)
+        found.append(logits.softmax(-1)[:, 0, phi.residue, 1 - state].double().mean().log())
+    return torch.stack(found)
