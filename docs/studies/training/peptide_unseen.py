@@ -33,13 +33,15 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from peptide_campaign import IMPLICIT, dynamics
+from peptide_campaign import IMPLICIT, WATER, dynamics, minimised
 from peptide_correction import Correction
 from peptide_rollouts import FRAMES_PS, frame_weights, rolled, thinned
 from peptide_scores import Turn, angles, library, rarely_positive, turns_of
 from peptide_transfer import trained_with
 
 from md_reference.forces.forcefield import build_system
+from md_reference.forces.solvation import solvate
+from md_reference.forces.spec import WaterBox
 from md_reference.run.machine import machine_name
 from surrogate.api import compare
 from surrogate.comparison.measure.distributions import distance
@@ -61,7 +63,7 @@ FloatArray = npt.NDArray[np.float64]
 Runs = Sequence[FloatArray]
 RUN_PS, LAGS_PS, BINS, JOINT_BINS, HALVES, SEED = 10_000.0, (100.0, 1000.0), 50, 36, 10, 0
 # By so many steps the pace of MD is measured; it is that of steps of 4 fs, as the runs have.
-PACE_STEPS, TIMESTEP_PS = 5000, 0.004
+PACE_STEPS, TIMESTEP_PS = {"obc2": 5000, "tip3p": 500}, 0.004
 # Shares of the time: of a state whose free energy is compared, and what one that was never seen counts as.
 VISITED, LEAST = 0.03, 0.001
 # Columns of the first table; the others make a second one.
@@ -175,20 +177,23 @@ def worst(md_files: Sequence[Path], rollouts: Sequence[Path]) -> tuple[float, st
 
 
 def bought(scene: Scene, frame_nm: FloatArray, md_file: Path, rollout: Path) -> float:
-    """Return the time of MD, ps of each of sixteen replicas, that a core simulates in the wall time of a rollout: in
-    OBC2 at the pace of some steps of MD now, in water as the file of MD says."""
+    """Return the time of MD, ps of each of sixteen replicas, that a core simulates in the wall time of a rollout, at
+    the pace of some steps of MD now."""
     with open_trajectory(md_file) as one, open_trajectory(rollout) as other:
-        spent_s, implicit = float(other.record["cost"]["wall_s"]), one.record["solvent"] == IMPLICIT.solvent
-        pace = float(one.time_ps[-1]) / float(one.record["cost"]["wall_s"])
-    if implicit:
-        run = dynamics(build_system(scene, IMPLICIT), 300.0, SEED)
-        run.set_positions(np.repeat(frame_nm[None], run.n_replicas, axis=0))
-        run.thermalise()
-        began = time.perf_counter()
-        run.step(PACE_STEPS)
-        # Of a replica; `pace` and `spent_s` are shares of a batch.
-        pace = run.n_replicas * PACE_STEPS * TIMESTEP_PS / (time.perf_counter() - began)
-    return pace * spent_s
+        spent_s, solvent = float(other.record["cost"]["wall_s"]), one.record["solvent"]
+    here, spec = scene.with_positions(frame_nm), IMPLICIT
+    if solvent == WATER.solvent:
+        here, spec = solvate(here, WATER, WaterBox()), WATER
+    system = build_system(here, spec)
+    run, start_nm = dynamics(system, 300.0, SEED), here.positions_nm
+    if spec is WATER:
+        start_nm = minimised(here, spec, system)
+    run.set_positions(np.repeat(start_nm[None], run.n_replicas, axis=0))
+    run.thermalise()
+    began, steps = time.perf_counter(), PACE_STEPS[solvent]
+    run.step(steps)
+    # Of a replica; `spent_s` is its share of a batch.
+    return run.n_replicas * steps * TIMESTEP_PS / (time.perf_counter() - began) * spent_s
 
 
 def correlation_times_ps(series: Sequence[FloatArray]) -> FloatArray:
