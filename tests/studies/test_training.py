@@ -31,7 +31,7 @@ from peptide_list import (
     unseen_peptides,
     wide_peptides,
 )
-from peptide_scores import Turn
+from peptide_scores import Turn, psi_crossings
 
 from surrogate.comparison.rows.published_metrics import TABLE
 from systems.errors import InputError
@@ -247,16 +247,12 @@ def test_free_energies_of_states_are_compared_in_kt() -> None:
     assert peptide_unseen.free_energy_errors(turns, md, of, [0], [once, weighed])[0] < 0.1
 
 
-def test_means_over_molecules_in_water() -> None:
-    assert ("joint", 16) in peptide_water.tasks((1, 16)) and ("joint", 1) not in peptide_water.tasks((1, 16))
-    rows = [
-        {"torsions, single": [a, 1], "torsions, pooled": [2 * a, 1], "joint maps, pooled": None if a > 1 else [3, 1],
-         "kinetics": {"ψ 1": b, "TICA 0": 9.0}, "free energies of states, kT: error, MD's halves": (a, 0.5)}
-        for a, b in ((1.0, 0.25), (2.0, 1.0))
-    ]  # fmt: skip
-    one, pooled, joint, energies, psi = peptide_water.mean_row(rows)
-    assert (one, pooled, joint) == ("1.50 (2.00)", "3.00 (4.00)", "3.00 (3.00)")
-    assert energies == "1.58 (0.50)" and psi.startswith("0.50 (")
+def test_what_is_trained_and_measured_in_water() -> None:
+    assert peptide_water.tasks(["new", "whole"], [1, 16])[:3] == [("new", 16), ("whole", 16), ("new", 1)]
+    degrees = np.array([-60.0, -40, 60, -50, 150, 170, -170, 140, 20, 0, 130])
+    assert psi_crossings(np.radians(degrees)) == 3, "60 and -170 degrees are in neither middle"
+    counts = np.array([[30.0, 10.0], [10.0, 10.0]])
+    assert peptide_water.with_error(lambda some: np.divide(*counts[some].sum(axis=0)), 2) == "2 ± 1"
 
 
 def test_no_training_takes_what_is_tested_by(tmp_path: Path) -> None:

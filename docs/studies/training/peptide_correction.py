@@ -2,7 +2,7 @@
 
 The simplest transfer from one solvent to another, which trains nothing: each frame counts exp(-ΣΔF/kT), ΔF the
 difference of the free energies of a residue's (φ, ψ) between both solvents by MD of its monomer ACE-X-NME, and times
-are stretched by one factor, the median ratio of the correlation times of cos ψ.
+are stretched by one factor, the median ratio of the times in which ψ goes from one basin to the other.
 """
 
 from __future__ import annotations
@@ -15,9 +15,8 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 from peptide_rollouts import FRAMES_PS, thinned
-from peptide_scores import Turn, angles, turns_of
+from peptide_scores import Turn, angles, psi_crossings, turns_of
 
-from surrogate.comparison.measure.kinetics import zero_crossing
 from systems.errors import InputError
 
 FloatArray = npt.NDArray[np.float64]
@@ -66,11 +65,12 @@ def _cell(x: FloatArray) -> npt.NDArray[np.int64]:
 
 
 def _map_and_time(runs: Sequence[Path]) -> tuple[FloatArray, float]:
-    """Return the (φ, ψ) map of a monomer, and the correlation time of its cos ψ, ps."""
+    """Return the (φ, ψ) map of a monomer, and the mean time between crossings of its ψ, ps."""
     scene, frames, _ = thinned(runs)
     turns = turns_of(scene)
     found = [angles(turns, x) for x in frames]
     phi, psi = (next(k for k, t in enumerate(turns) if t.kind == kind) for kind in ("phi", "psi"))
     whole = np.concatenate(found)
     counts = PRIOR / CELLS**2 * len(runs) + np.histogram2d(whole[:, phi], whole[:, psi], (_EDGES, _EDGES))[0]
-    return counts / counts.sum(), FRAMES_PS * zero_crossing([np.cos(x[:, [psi]][:, 0]) for x in found])[1]
+    # One more than were seen, or none would be for ever.
+    return counts / counts.sum(), FRAMES_PS * len(whole) / (1 + sum(psi_crossings(x[:, psi]) for x in found))

@@ -25,6 +25,8 @@ if TYPE_CHECKING:
 
 FloatArray = npt.NDArray[np.float64]
 _LEAST_ENTRIES = 10
+# The middles of the basins of psi, helices and strands.
+_CORES_DEG = ((-100.0, 30.0), (100.0, 180.0))
 
 
 @dataclass(frozen=True)
@@ -50,6 +52,14 @@ def turns_of(scene: Scene) -> list[Turn]:
             )
     rank = {r: k for k, r in enumerate(sorted({r for _, r, _, _ in found}))}
     return [Turn(kind, rank[r], (q[0], q[1], q[2], q[3]), fold) for kind, r, q, fold in found]
+
+
+def psi_crossings(psi: FloatArray) -> int:
+    """Return how often psi (n_frames,) in rad comes from the middle of one basin to that of the other."""
+    degrees = np.degrees(psi)
+    inside = np.stack([(degrees > low) & (degrees < high) for low, high in _CORES_DEG])
+    core = inside[1][inside.any(axis=0)]
+    return int((core[1:] != core[:-1]).sum())
 
 
 def angles(turns: Sequence[Turn], frames_nm: npt.NDArray[np.floating]) -> FloatArray:

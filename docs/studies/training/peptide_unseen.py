@@ -28,6 +28,7 @@ import math
 import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -183,7 +184,7 @@ def bought(scene: Scene, frame_nm: FloatArray, md_file: Path, rollout: Path) -> 
         spent_s, solvent = float(other.record["cost"]["wall_s"]), one.record["solvent"]
     here, spec = scene.with_positions(frame_nm), IMPLICIT
     if solvent == WATER.solvent:
-        here, spec = solvate(here, WATER, WaterBox()), WATER
+        here, spec = solvate(replace(here, cell_nm=None), WATER, WaterBox()), WATER
     system = build_system(here, spec)
     run, start_nm = dynamics(system, 300.0, SEED), here.positions_nm
     if spec is WATER:

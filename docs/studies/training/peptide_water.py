@@ -1,14 +1,17 @@
 """What implicit data are worth for peptides in explicit water: weights for OBC2 on molecules in TIP3P, in six ways.
 
-    python docs/studies/training/peptide_water.py train FOLDER WATER OBC2 [--start W] [--runs 1 4 16] [--steps 600]
+    python docs/studies/training/peptide_water.py train FOLDER WATER OBC2 [--start W] [--methods new solvent whole joint]
+               [--runs 1 4 16] [--steps 600]
     python docs/studies/training/peptide_water.py table FOLDER WATER OBC2 [--start W]
 
 WATER and OBC2 are folders of `peptide_campaign`: what is in WATER/train is learned from, of each molecule so many runs,
-and what is in WATER/test is rolled (`peptide_unseen`). Weights W, for OBC2, are taken as they are (`unchanged`); their
-frames are weighed and their time is stretched as monomers in both solvents say (`corrected`, `peptide_correction`);
-they are trained further, `whole`, or what a solvent has of its own alone (`solvent`), or whole on both folders
-(`joint`); and weights are trained `new`, from nothing. `train` makes FOLDER/METHOD-RUNS.safetensors, one after the
-other in one process a core; what is there stays. `table` rolls them all.
+and what is in WATER/test is rolled as often and as long, from the same first frames. Weights W, for OBC2, are taken as
+they are (`unchanged`); their frames are weighed and their time is stretched as monomers in both solvents say
+(`corrected`, `peptide_correction`); they are trained further, `whole`, or what a solvent has of its own alone
+(`solvent`), or whole on both folders (`joint`); and weights are trained `new`, from nothing. `train` makes
+FOLDER/METHOD-RUNS.safetensors, one after the other in one process a core; what is there stays. `table` rolls them all,
+beside MD in both solvents: how far torsions are from MD's in water (`peptide_unseen`, pooled), and of every ψ the share
+of time in helices and how often it crosses to the other basin or back.
 """
 
 from __future__ import annotations
@@ -17,22 +20,29 @@ import argparse
 import json
 import math
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 import peptide_transfer
 from peptide_correction import Correction
-from peptide_unseen import molecule
+from peptide_rollouts import FRAMES_PS, rolled, thinned
+from peptide_scores import Turn, angles, psi_crossings, rarely_positive, turns_of
+from peptide_unseen import densities, over, pooled, shown
 from processes import in_order, is_trained
 
 from md_reference.run.machine import available_cores, machine_name
+from md_reference.simd.force_field import n_replicas
+from surrogate.comparison.measure.distributions import is_alpha
 from surrogate.models.architecture import weights_path
 from surrogate.models.weights import load_weights
+from systems.scene import Scene
 from systems.trajectory.codec import open_trajectory
 
+FloatArray = npt.NDArray[np.float64]
 TABLES = Path(__file__).parents[2] / "results" / "tables"
 # By what follows `peptide_transfer`: whether it goes on from weights, and what is tuned of these.
 TRAINED = {"new": None, "solvent": "solvent", "whole": "all", "joint": "all"}
@@ -40,15 +50,11 @@ WORDS = {
     "unchanged": "as they are", "corrected": "reweighted and stretched by monomers", "new": "trained from nothing",
     "solvent": "the solvent's own parts tuned", "whole": "tuned whole", "joint": "tuned whole, on both solvents",
 }  # fmt: skip
-# MD of one core in this time stands beside the equivalent MD time of rollouts.
-MINUTES = 10.0
 
 
-def tasks(runs: Sequence[int]) -> list[tuple[str, int]]:
-    """Return what is trained, the most runs first; on both folders with the most runs alone."""
-    return [
-        (method, n) for n in sorted(runs, reverse=True) for method in TRAINED if method != "joint" or n == max(runs)
-    ]
+def tasks(methods: Sequence[str], runs: Sequence[int]) -> list[tuple[str, int]]:
+    """Return what is trained, the most runs first."""
+    return [(method, n) for n in sorted(runs, reverse=True) for method in methods]
 
 
 def train(
@@ -73,59 +79,113 @@ def simulated_ns(folder: Path, runs: int) -> float:
     return total_ps * 1e-3
 
 
-def mean_row(rows: Sequence[dict[str, Any]]) -> list[str]:
-    """Return a line of the table, of the lines of test molecules."""
+class Molecule(NamedTuple):
+    """A molecule that is tested by: its scene in water, torsions, runs of MD in water and in OBC2 as torsions
+    `(n_frames, n_torsions)` in rad, the first frames in water, and how long a run is."""
 
-    def of(what: str) -> list[float]:
-        return [row[what][0] for row in rows if row[what]]
+    name: str
+    scene: Scene
+    turns: list[Turn]
+    md: list[FloatArray]
+    in_obc2: list[FloatArray]
+    starts_nm: FloatArray
+    time_ps: float
 
-    off = [x for row in rows for name, x in row["kinetics"].items() if name.startswith("ψ") and math.isfinite(x)]
-    errors, floors = np.array([row["free energies of states, kT: error, MD's halves"] for row in rows]).T
-    spread = math.exp(float(np.std(np.log(off), ddof=1) / math.sqrt(len(off)))) if len(off) > 1 else math.nan
-    return [
-        *(f"{np.mean(of(what)):.2f} ({max(of(what)):.2f})"
-          for what in ("torsions, single", "torsions, pooled", "joint maps, pooled") if of(what)),
-        f"{np.sqrt(np.mean(errors**2)):.2f} ({np.sqrt(np.mean(floors**2)):.2f})",
-        f"{math.exp(float(np.mean(np.log(off)))):.2f} (×/÷ {spread:.2f})",
-    ]  # fmt: skip
+    @classmethod
+    def of(cls, water: Path, obc2: Path, name: str) -> Molecule:
+        scene, frames, time_ps = thinned(sorted((water / "test" / name).glob("run_*.h5")))
+        turns, implicit = turns_of(scene), thinned(sorted((obc2 / "test" / name).glob("run_*.h5")))[1]
+        md, in_obc2 = ([angles(turns, x) for x in some] for some in (frames, implicit))
+        return cls(name, scene, turns, md, in_obc2, np.stack([x[0] for x in frames]), time_ps)
+
+    @property
+    def residues(self) -> list[str]:
+        return [name for name in self.scene.residue_names if name not in ("ACE", "NME")]
+
+    @property
+    def psi(self) -> dict[str, int]:
+        """Every ψ, by what it is called in a table."""
+        return {f"ψ of {self.residues[t.residue]} in {self.name}": k
+                for k, t in enumerate(self.turns) if t.kind == "psi"}  # fmt: skip
+
+    def apart(self, runs: Sequence[FloatArray], weights: Sequence[FloatArray]) -> float:
+        """Return how far torsions are from MD's in water, pooled, over MD's own; a φ > 0 that MD hardly enters plays no
+        part."""
+        rare, n = rarely_positive(self.turns, self.md), min(map(len, self.md))
+        both = []
+        for some, counted in ((self.md, None), ([x[:n] for x in runs], weights)):
+            left = [(~x).astype(np.float64) for x in shown(some, rare)]
+            if counted is not None:
+                left = [a * b[:n] for a, b in zip(left, counted, strict=True)]
+            both.append(densities(some, left))
+        return over(pooled, *both)[0]
+
+
+def with_error(of: Callable[[list[int]], float], n: int) -> str:
+    """Return what a statistic is of all `n` runs, and its standard error by leaving one out after the other."""
+    without = [of([k for k in range(n) if k != left]) for left in range(n)]
+    return f"{of(list(range(n))):.2g} ± {math.sqrt((n - 1) * float(np.var(without))):.1g}"
+
+
+def row(
+    words: str, ns: str, of: Sequence[tuple[Molecule, list[FloatArray], list[FloatArray]]], clock: float = 1.0
+) -> list[str]:  # fmt: skip
+    """Return a line of the table: of each molecule runs, and what their frames count."""
+    apart = [molecule.apart(runs, weights) for molecule, runs, weights in of]
+    helices, often = [], []
+    for molecule, runs, weights in of:
+        for k in molecule.psi.values():
+            alpha = np.array([[(w * is_alpha(x[:, k])).sum(), w.sum()] for x, w in zip(runs, weights, strict=True)])
+            count = np.array([[1e3 * psi_crossings(x[:, k]) / clock, FRAMES_PS * len(x)] for x in runs])
+            for found, each, factor in ((helices, alpha, 100.0), (often, count, 1.0)):
+                found.append(with_error(lambda some, e=each, f=factor: f * np.divide(*e[some].sum(axis=0)), len(runs)))
+    return [words, ns, f"{np.mean(apart):.2f}", *helices, *often]
 
 
 def make_table(folder: Path, water: Path, obc2: Path, start: str, out: Path) -> None:
+    tests = [Molecule.of(water, obc2, place.name) for place in sorted((water / "test").iterdir())
+             if len(list(place.glob("run_*.h5"))) >= 4]  # fmt: skip
     correction = Correction.of(water / "train", obc2 / "train")
-    tests = {place.name: files for place in sorted((water / "test").iterdir())
-             if len(files := sorted(place.glob("run_*.h5"))) >= 4}  # fmt: skip
-    todo: list[tuple[str, int, Path, str | None, Correction | None]] = [
-        ("unchanged", 0, weights_path(start), None, None), ("corrected", 16, weights_path(start), None, correction)
-    ]  # fmt: skip
+
+    def even(some: Sequence[list[FloatArray]]) -> list[tuple[Molecule, list[FloatArray], list[FloatArray]]]:
+        return [(m, runs, [np.ones(len(x)) for x in runs]) for m, runs in zip(tests, some, strict=True)]
+
+    def roll(path: Path, solvent: str | None) -> list[list[FloatArray]]:
+        weights, found = load_weights(path), []
+        for m in tests:
+            outs = [folder / path.stem / m.name / f"{k:02d}.h5" for k in range(len(m.md))]
+            frames = rolled(weights, m.scene, outs, m.time_ps, FRAMES_PS, solvent, m.starts_nm)
+            found.append([angles(m.turns, x) for x in frames])
+        return found
+
+    unchanged = roll(weights_path(start), None)
+    weighed = [(m, runs, [correction.weights(m.turns, m.residues, x) for x in runs])
+               for m, runs in zip(tests, unchanged, strict=True)]  # fmt: skip
+    ns = f"{simulated_ns(water / 'train', n_replicas()):.0f}"
+    lines = [
+        row("MD in TIP3P", "", even([m.md for m in tests])),
+        row("MD in OBC2", "", even([m.in_obc2 for m in tests])),
+        row(WORDS["unchanged"], "0", even(unchanged)),
+        row(WORDS["corrected"], ns, weighed, correction.clock),
+    ]
     made = {(list(TRAINED).index(path.stem.split("-")[0]), int(path.stem.split("-")[1])): path
             for path in folder.glob("*-*.safetensors") if is_trained(path)}  # fmt: skip
     for (k, n), path in sorted(made.items()):
         method = list(TRAINED)[k]
-        todo.append((method, n, path, "tip3p" if TRAINED[method] else None, None))
-    lines, found = [], {}
-    for method, n, path, solvent, corrected in todo:
-        rows = {name: molecule(load_weights(path), runs, folder / method / str(n) / name, solvent, corrected)
-                for name, runs in tests.items()}  # fmt: skip
-        found[f"{method}-{n}"] = rows
-        (folder / "rows.json").write_text(json.dumps(found, indent=1, ensure_ascii=False), "utf-8")
-        ns = simulated_ns(water / "train", n) if n else 0.0
-        equivalent = [ns for row in rows.values() if math.isfinite(ns := row["equivalent MD time"][0])]
-        lines.append([WORDS[method], f"{ns:.0f}", *mean_row(list(rows.values())),
-                      f"{np.median(equivalent):.2g}" if equivalent and not corrected else "-",
-                      f"{np.median([row['MD of the same wall time, ns'] for row in rows.values()]):.2g}"])  # fmt: skip
-        sys.stdout.write(" | ".join(lines[-1]) + "\n")
-        sys.stdout.flush()
-    shown = " and ".join(f"{name} ({row['frames']} frames)" for name, row in rows.items())
+        lines.append(row(WORDS[method], f"{simulated_ns(water / 'train', n):.0f}",
+                         even(roll(path, "tip3p" if TRAINED[method] else None))))  # fmt: skip
+    named = [name for m in tests for name in m.psi]
     table = {
         "command": f"python docs/studies/training/peptide_water.py table FOLDER WATER OBC2 --start {start}",
         "machine": machine_name(),
-        "note": f"Means over {shown}; largest in brackets, of ψ the standard error. Times are stretched by "
-        f"{correction.clock:.2f}.",
-        "columns": ["weights for OBC2", "MD in water, ns", "torsions, one run", "torsions, pooled",
-                    "joint maps, pooled", "free energies of states, kT (MD's halves)", "ψ remembered, over MD's",
-                    "equivalent MD time, ns", "MD of the same wall time, ns"],
+        "note": f"{len(tests[0].md)} runs of {1e-3 * tests[0].time_ps:.2g} ns of each molecule, rollouts from "
+        f"the first frames of MD in TIP3P, MD in OBC2 longer; errors over runs. Stretched by {correction.clock:.1f}.",
+        "columns": ["weights for OBC2", "MD in water, ns", "torsions, pooled",
+                    *(f"{name}, helices, %" for name in named), *(f"{name}, crossings a ns" for name in named)],
         "rows": lines,
     }  # fmt: skip
+    for line in lines:
+        sys.stdout.write(" | ".join(line) + "\n")
     out.write_text(json.dumps(table, ensure_ascii=False, indent=1) + "\n", "utf-8")
 
 
@@ -136,6 +196,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("water", type=Path)
     parser.add_argument("obc2", type=Path)
     parser.add_argument("--start", default="peptides")
+    parser.add_argument("--methods", nargs="+", choices=TRAINED, default=list(TRAINED))
     parser.add_argument("--runs", type=int, nargs="+", default=(1, 4, 16))
     parser.add_argument("--steps", type=int, default=600)
     parser.add_argument("--workers", type=int, default=available_cores())
@@ -145,7 +206,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     if a.what == "table":
         make_table(a.folder, a.water, a.obc2, a.start, a.out)
         return
-    in_order(partial(tasks, tuple(a.runs)), train, math.inf, a.workers, a.folder, a.water, a.obc2, a.start, a.steps)
+    in_order(partial(tasks, a.methods, a.runs), train, math.inf, a.workers, a.folder, a.water, a.obc2, a.start, a.steps)
 
 
 if __name__ == "__main__":

@@ -58,6 +58,7 @@ _WHOLE = 40
 # What each solvent has of its own, beside means, scales and correlations.
 SOLVENT_PARTS = ("flow.of_solvent.weight", "jumps.of_solvent.weight", "jumps.of_change", "jumps.beside_change")
 TUNED = ("all", "states", "solvent")
+_SOLVENT_RATE = 10.0
 # Torsions' numbers vary by at least this: omega's cosine is all but constant, and nothing is learned of its rounding.
 _LEAST_SCALE = 0.05
 
@@ -129,11 +130,12 @@ def train_peptides(
     flow_s, jumps_s = (
         None if training.budget_s is None else share * training.budget_s for share in (1 - of_jumps, of_jumps)
     )
+    rate = training.learning_rate
+    # What a solvent has of its own are few numbers, far from where they end. Decay would move those of others, too.
+    rate, decay = (_SOLVENT_RATE * rate, 0.0) if training.tuned == "solvent" else (rate, StageConfig.weight_decay)
     shared = StageConfig(
-        "flow", training.batch, training.learning_rate, flow_s, training.steps, seed=training.seed,
-        bf16=training.bf16, validate_every_s=training.validate_every_s,
-        # Decay would move what other solvents have of their own.
-        weight_decay=0.0 if training.tuned == "solvent" else StageConfig.weight_decay,
+        "flow", training.batch, rate, flow_s, training.steps, seed=training.seed, bf16=training.bf16,
+        validate_every_s=training.validate_every_s, weight_decay=decay,
     )  # fmt: skip
     stages = (shared, replace(shared, name="jumps", batch=_JUMPS_BATCH, budget_s=jumps_s, bf16=False))
     n_held = min(_HELD_WINDOWS, max(_LEAST_HELD, _HELD_IN_ALL // (len(subjects) + len(held_out))))
