@@ -1,7 +1,7 @@
 """What implicit data are worth for peptides in explicit water: weights for OBC2 on molecules in TIP3P, in six ways.
 
-    python docs/studies/training/peptide_water.py train FOLDER WATER OBC2 [--start W] [--methods new solvent whole joint]
-               [--runs 1 4 16] [--steps 600]
+    python docs/studies/training/peptide_water.py train FOLDER WATER OBC2 [--start W] [--runs 1 4 16]
+               [--methods new solvent whole joint] [--steps 600]
     python docs/studies/training/peptide_water.py table FOLDER WATER OBC2 [--start W]
 
 WATER and OBC2 are folders of `peptide_campaign`: what is in WATER/train is learned from, of each molecule so many runs,
@@ -10,8 +10,9 @@ they are (`unchanged`); their frames are weighed and their time is stretched as 
 (`corrected`, `peptide_correction`); they are trained further, `whole`, or what a solvent has of its own alone
 (`solvent`), or whole on both folders (`joint`); and weights are trained `new`, from nothing. `train` makes
 FOLDER/METHOD-RUNS.safetensors, one after the other in one process a core; what is there stays. `table` rolls them all,
-beside MD in both solvents: how far torsions are from MD's in water (`peptide_unseen`, pooled), and of every ψ the share
-of time in helices and how often it crosses to the other basin or back.
+beside MD in both solvents: how far torsions are from MD's in water (`peptide_unseen`, pooled), of every ψ the share of
+time in helices and how often it crosses to the other basin or back, and the pace over that of MD by SIMD replicas on
+the same core.
 """
 
 from __future__ import annotations
@@ -31,7 +32,7 @@ import peptide_transfer
 from peptide_correction import Correction
 from peptide_rollouts import FRAMES_PS, rolled, thinned
 from peptide_scores import Turn, angles, psi_crossings, rarely_positive, turns_of
-from peptide_unseen import densities, over, pooled, shown
+from peptide_unseen import bought, densities, over, pooled, shown
 from processes import in_order, is_trained
 
 from md_reference.run.machine import available_cores, machine_name
@@ -81,7 +82,7 @@ def simulated_ns(folder: Path, runs: int) -> float:
 
 class Molecule(NamedTuple):
     """A molecule that is tested by: its scene in water, torsions, runs of MD in water and in OBC2 as torsions
-    `(n_frames, n_torsions)` in rad, the first frames in water, and how long a run is."""
+    `(n_frames, n_torsions)` in rad, the first frames in water, how long a run is, and the file of one."""
 
     name: str
     scene: Scene
@@ -90,13 +91,15 @@ class Molecule(NamedTuple):
     in_obc2: list[FloatArray]
     starts_nm: FloatArray
     time_ps: float
+    md_file: Path
 
     @classmethod
     def of(cls, water: Path, obc2: Path, name: str) -> Molecule:
-        scene, frames, time_ps = thinned(sorted((water / "test" / name).glob("run_*.h5")))
+        files = sorted((water / "test" / name).glob("run_*.h5"))
+        scene, frames, time_ps = thinned(files)
         turns, implicit = turns_of(scene), thinned(sorted((obc2 / "test" / name).glob("run_*.h5")))[1]
         md, in_obc2 = ([angles(turns, x) for x in some] for some in (frames, implicit))
-        return cls(name, scene, turns, md, in_obc2, np.stack([x[0] for x in frames]), time_ps)
+        return cls(name, scene, turns, md, in_obc2, np.stack([x[0] for x in frames]), time_ps, files[0])
 
     @property
     def residues(self) -> list[str]:
@@ -150,30 +153,32 @@ def make_table(folder: Path, water: Path, obc2: Path, start: str, out: Path) -> 
     def even(some: Sequence[list[FloatArray]]) -> list[tuple[Molecule, list[FloatArray], list[FloatArray]]]:
         return [(m, runs, [np.ones(len(x)) for x in runs]) for m, runs in zip(tests, some, strict=True)]
 
-    def roll(path: Path, solvent: str | None) -> list[list[FloatArray]]:
-        weights, found = load_weights(path), []
+    def roll(path: Path, solvent: str | None) -> tuple[list[list[FloatArray]], str]:
+        """Return what weights roll, and how many times faster than MD by SIMD replicas on this core."""
+        weights, found, faster = load_weights(path), [], []
         for m in tests:
             outs = [folder / path.stem / m.name / f"{k:02d}.h5" for k in range(len(m.md))]
             frames = rolled(weights, m.scene, outs, m.time_ps, FRAMES_PS, solvent, m.starts_nm)
             found.append([angles(m.turns, x) for x in frames])
-        return found
+            faster.append(m.time_ps / bought(m.scene, m.starts_nm[0], m.md_file, outs[0]))
+        return found, f"{np.mean(faster):.2g}"
 
-    unchanged = roll(weights_path(start), None)
+    unchanged, faster = roll(weights_path(start), None)
     weighed = [(m, runs, [correction.weights(m.turns, m.residues, x) for x in runs])
                for m, runs in zip(tests, unchanged, strict=True)]  # fmt: skip
     ns = f"{simulated_ns(water / 'train', n_replicas()):.0f}"
     lines = [
-        row("MD in TIP3P", "", even([m.md for m in tests])),
-        row("MD in OBC2", "", even([m.in_obc2 for m in tests])),
-        row(WORDS["unchanged"], "0", even(unchanged)),
-        row(WORDS["corrected"], ns, weighed, correction.clock),
+        [*row("MD in TIP3P", "", even([m.md for m in tests])), "1"],
+        [*row("MD in OBC2", "", even([m.in_obc2 for m in tests])), ""],
+        [*row(WORDS["unchanged"], "0", even(unchanged)), faster],
+        [*row(WORDS["corrected"], ns, weighed, correction.clock), faster],
     ]
     made = {(list(TRAINED).index(path.stem.split("-")[0]), int(path.stem.split("-")[1])): path
             for path in folder.glob("*-*.safetensors") if is_trained(path)}  # fmt: skip
     for (k, n), path in sorted(made.items()):
         method = list(TRAINED)[k]
-        lines.append(row(WORDS[method], f"{simulated_ns(water / 'train', n):.0f}",
-                         even(roll(path, "tip3p" if TRAINED[method] else None))))  # fmt: skip
+        runs, faster = roll(path, "tip3p" if TRAINED[method] else None)
+        lines.append([*row(WORDS[method], f"{simulated_ns(water / 'train', n):.0f}", even(runs)), faster])
     named = [name for m in tests for name in m.psi]
     table = {
         "command": f"python docs/studies/training/peptide_water.py table FOLDER WATER OBC2 --start {start}",
@@ -181,7 +186,8 @@ def make_table(folder: Path, water: Path, obc2: Path, start: str, out: Path) -> 
         "note": f"{len(tests[0].md)} runs of {1e-3 * tests[0].time_ps:.2g} ns of each molecule, rollouts from "
         f"the first frames of MD in TIP3P, MD in OBC2 longer; errors over runs. Stretched by {correction.clock:.1f}.",
         "columns": ["weights for OBC2", "MD in water, ns", "torsions, pooled",
-                    *(f"{name}, helices, %" for name in named), *(f"{name}, crossings a ns" for name in named)],
+                    *(f"{name}, helices, %" for name in named), *(f"{name}, crossings a ns" for name in named),
+                    "faster than MD, times"],
         "rows": lines,
     }  # fmt: skip
     for line in lines:

@@ -16,9 +16,9 @@ from surrogate.models.peptides.layout import kinds_of
 from surrogate.models.peptides.model import PeptideSlide, times_apart
 from surrogate.models.peptides.subjects import PeptideSubject
 
-# Log-likelihood hardly minds a rate that is wrong by a third, and populations do. So after training the levels of a
-# residue's type and of its neighbours' are moved, for every torsion and both directions of every change alike, to where
-# as many frames of equilibrium go one way as the other in the mean over training peptides.
+# Trained by log-likelihood alone, not quite as many frames of equilibrium go one way as the other, and populations err
+# by as much. So after training the levels of a residue's type and of its neighbours' are moved, for every torsion and
+# both directions of every change alike, to where fluxes are equal in the mean over training peptides.
 #
 # Runs from chosen starts show hundreds of exits from phi > 0 and hardly an entry, and a rate that is three times too
 # high shows in no loss. There the probabilities of entering alone are moved, given those of leaving and the free energy
