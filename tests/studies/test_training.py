@@ -253,6 +253,7 @@ def test_what_is_trained_and_measured_in_water() -> None:
     assert psi_crossings(np.radians(degrees)) == 3, "60 and -170 degrees are in neither middle"
     counts = np.array([[30.0, 10.0], [10.0, 10.0]])
     assert peptide_water.with_error(lambda some: np.divide(*counts[some].sum(axis=0)), 2) == "2 ± 1"
+    assert peptide_water.with_error(lambda some: 10.0 * len(some) + 0.1 * (0 in some), 2) == "20.10 ± 0.05"
 
 
 def test_no_training_takes_what_is_tested_by(tmp_path: Path) -> None:

@@ -127,7 +127,9 @@ class Molecule(NamedTuple):
 def with_error(of: Callable[[list[int]], float], n: int) -> str:
     """Return what a statistic is of all `n` runs, and its standard error by leaving one out after the other."""
     without = [of([k for k in range(n) if k != left]) for left in range(n)]
-    return f"{of(list(range(n))):.2g} ± {math.sqrt((n - 1) * float(np.var(without))):.1g}"
+    error = math.sqrt((n - 1) * float(np.var(without)))
+    digits = max(0, -math.floor(math.log10(error))) if error > 0 else 2
+    return f"{of(list(range(n))):.{digits}f} ± {error:.{digits}f}"
 
 
 def row(
@@ -161,7 +163,7 @@ def make_table(folder: Path, water: Path, obc2: Path, start: str, out: Path) -> 
             frames = rolled(weights, m.scene, outs, m.time_ps, FRAMES_PS, solvent, m.starts_nm)
             found.append([angles(m.turns, x) for x in frames])
             faster.append(m.time_ps / bought(m.scene, m.starts_nm[0], m.md_file, outs[0]))
-        return found, f"{np.mean(faster):.2g}"
+        return found, f"{float(f'{np.mean(faster):.2g}'):,.0f}"
 
     unchanged, faster = roll(weights_path(start), None)
     weighed = [(m, runs, [correction.weights(m.turns, m.residues, x) for x in runs])
