@@ -108,7 +108,7 @@ class Molecule(NamedTuple):
     @property
     def psi(self) -> dict[str, int]:
         """Every ψ, by what it is called in a table."""
-        return {f"ψ of {self.residues[t.residue]} in {self.name}": k
+        return {f"ψ of {self.residues[t.residue]} ({self.name})": k
                 for k, t in enumerate(self.turns) if t.kind == "psi"}  # fmt: skip
 
     def apart(self, runs: Sequence[FloatArray], weights: Sequence[FloatArray]) -> float:
@@ -182,19 +182,23 @@ def make_table(folder: Path, water: Path, obc2: Path, start: str, out: Path) -> 
         runs, faster = roll(path, "tip3p" if TRAINED[method] else None)
         lines.append([*row(WORDS[method], f"{simulated_ns(water / 'train', n):.0f}", even(runs)), faster])
     named = [name for m in tests for name in m.psi]
-    table = {
+    about = {
         "command": f"python docs/studies/training/peptide_water.py table FOLDER WATER OBC2 --start {start}",
         "machine": machine_name(),
-        "note": f"{len(tests[0].md)} runs of {1e-3 * tests[0].time_ps:.2g} ns of each molecule, rollouts from "
-        f"the first frames of MD in TIP3P, MD in OBC2 longer; errors over runs. Stretched by {correction.clock:.1f}.",
-        "columns": ["weights for OBC2", "MD in water, ns", "torsions, pooled",
-                    *(f"{name}, helices, %" for name in named), *(f"{name}, crossings a ns" for name in named),
-                    "faster than MD, times"],
-        "rows": lines,
-    }  # fmt: skip
+    }
+    note = (
+        f"{len(tests[0].md)} runs of {1e-3 * tests[0].time_ps:.2g} ns of each molecule, rollouts from the first frames "
+        f"of MD in TIP3P, MD in OBC2 longer; errors over runs. Stretched by {correction.clock:.1f}."
+    )
+    n = 3 + len(named)
+    for path, columns, rows in (
+        (out, [*named, "faster than MD, times"], [[*line[:2], *line[n:]] for line in lines]),
+        (out.with_stem(f"{out.stem}_helices"), ["torsions, pooled", *named], [line[:n] for line in lines]),
+    ):
+        table = {"columns": ["weights for OBC2", "MD in water, ns", *columns], "rows": rows, **about, "note": note}
+        path.write_text(json.dumps(table, ensure_ascii=False, indent=1) + "\n", "utf-8")
     for line in lines:
         sys.stdout.write(" | ".join(line) + "\n")
-    out.write_text(json.dumps(table, ensure_ascii=False, indent=1) + "\n", "utf-8")
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
