@@ -231,22 +231,6 @@ def test_the_farthest_state_is_named_with_both_populations() -> None:
     assert peptide_unseen.farthest_state(turns, ["ALA"], md, of, [1]).startswith("phi of ALA 1, ")
 
 
-def test_free_energies_of_states_are_compared_in_kt() -> None:
-    turns = [Turn(kind, 0, (0, 1, 2, 3)) for kind in ("phi", "psi")]
-    rng = np.random.default_rng(0)
-
-    def runs(strands: float) -> list[np.ndarray]:
-        where = np.where(rng.random((8, 2000, 2)) < strands, 2.0, -1.0)
-        return list(where + 0.2 * rng.normal(size=where.shape))
-
-    md, of, once = runs(0.5), runs(0.8), all_count(runs(0.5))
-    error, halves = peptide_unseen.free_energy_errors(turns, md, of, [0], [once, once])
-    assert error == pytest.approx(math.hypot(math.log(1.6), math.log(0.4)) / math.sqrt(2), rel=0.05) and halves < 0.1
-    # Each frame in strands counts a quarter of one that is not, and populations are those of MD again.
-    weighed = [np.where(x[:, 1] > 0.5, 0.25, 1.0) for x in of]
-    assert peptide_unseen.free_energy_errors(turns, md, of, [0], [once, weighed])[0] < 0.1
-
-
 def test_what_is_trained_and_measured_in_water() -> None:
     assert peptide_water.tasks(["new", "whole"], [1, 16])[:3] == [("new", 16), ("whole", 16), ("new", 1)]
     degrees = np.array([-60.0, -40, 60, -50, 150, 170, -170, 140, 20, 0, 130])

@@ -1,7 +1,7 @@
 """Weights for peptides on molecules that they never saw, beside MD of these.
 
     python docs/studies/training/peptide_unseen.py FOLDER --weights W --test CAMPAIGN/test [--solvent tip3p]
-          [--library CAMPAIGN/train] [--corrected THERE/train HERE/train] [--molecules NAME ...] [-o TABLE.json]
+          [--library CAMPAIGN/train] [--molecules NAME ...] [-o TABLE.json]
 
 Of each molecule the weights roll as many runs as MD has, each from the first frame of one of these, as long as MD's but
 10 ns at most, unguarded, at lags of 10 ps, 100 ps and 1 ns as far as training had them (FOLDER/NAME; what is there is
@@ -16,8 +16,7 @@ of runs one of which shows it half of the time, and runs that show it out of kin
 `peptide_energies` and `peptide_gates seeds` say.
 
 Beside the model stand the first frames of MD's runs, as many as are simulated in the wall time of the rollout, and
-`--library`, torsions of monomers drawn without regard to neighbours (`peptide_scores`). `--corrected`: rollouts in one
-solvent (HERE) weighed and stretched as runs of monomers in another say (`peptide_correction`).
+`--library`, torsions of monomers drawn without regard to neighbours (`peptide_scores`).
 """
 
 from __future__ import annotations
@@ -35,7 +34,6 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 from peptide_campaign import IMPLICIT, WATER, dynamics, minimised
-from peptide_correction import Correction
 from peptide_rollouts import FRAMES_PS, frame_weights, rolled, thinned
 from peptide_scores import Turn, angles, library, rarely_positive, turns_of
 from peptide_transfer import trained_with
@@ -65,8 +63,6 @@ Runs = Sequence[FloatArray]
 RUN_PS, LAGS_PS, BINS, JOINT_BINS, HALVES, SEED = 10_000.0, (100.0, 1000.0), 50, 36, 10, 0
 # By so many steps the pace of MD is measured; it is that of steps of 4 fs, as the runs have.
 PACE_STEPS, TIMESTEP_PS = {"obc2": 5000, "tip3p": 500}, 0.004
-# Shares of the time: of a state whose free energy is compared, and what one that was never seen counts as.
-VISITED, LEAST = 0.03, 0.001
 # Columns of the first table; the others make a second one.
 DISTANCES = 7
 
@@ -217,34 +213,13 @@ def kinetics(md: Runs, of: Runs, psi: Sequence[int]) -> dict[str, float]:
     return {name: float(ratio[0]) for name, ratio in ratios.items()}
 
 
-def populations(wells: Sequence[Any], runs: Runs, weights: Runs | None = None) -> FloatArray:
-    """Return the population of every state of every torsion, of frames that count `weights`."""
-    found, counted = [], None if weights is None else np.concatenate(weights)
+def populations(wells: Sequence[Any], runs: Runs) -> FloatArray:
+    """Return the population of every state of every torsion."""
+    found = []
     for k, of in enumerate(wells):
         states = np.concatenate(of.assign([x[:, k] for x in runs]))
-        counts = np.bincount(states, counted, len(of.names))
-        found += (counts / counts.sum()).tolist()
+        found += (np.bincount(states, minlength=len(of.names)) / len(states)).tolist()
     return np.array(found)
-
-
-def free_energy_errors(
-    turns: Sequence[Turn], md: Runs, of: Runs, rare: Sequence[int], counted: Sequence[Runs]
-) -> tuple[float, float]:  # fmt: skip
-    """Return the root mean square error of the free energies of states of torsions that MD visits well, in kT, and how
-    far halves of MD's runs are apart. States of torsions `rare` play no part; frames of both count `counted`."""
-    kept = [k for k in range(len(turns)) if k not in rare]
-    md, of = [x[:, kept] for x in md], [x[:, kept] for x in of]
-    wells = [find_wells([x[:, i] for x in md], fold=turns[k].fold) for i, k in enumerate(kept)]
-    here, there, *halves = (
-        populations(wells, *some) for some in ((md, counted[0]), (of, counted[1]),
-                                               *((md[k::2], counted[0][k::2]) for k in (0, 1)))
-    )  # fmt: skip
-    visited = here > VISITED
-
-    def apart(a: FloatArray, b: FloatArray) -> float:
-        return float(np.sqrt(np.mean(np.log(np.maximum(a, LEAST) / np.maximum(b, LEAST))[visited] ** 2)))
-
-    return apart(there, here), apart(*halves)
 
 
 def lag_errors(md: Runs, at_10: Runs, others: dict[float, Runs]) -> dict[str, float]:
@@ -273,7 +248,7 @@ def farthest_state(turns: Sequence[Turn], residues: Sequence[str], md: Runs, of:
 
 
 def molecule(
-    weights: Weights, runs: Sequence[Path], folder: Path, solvent: str | None, correction: Correction | None = None,
+    weights: Weights, runs: Sequence[Path], folder: Path, solvent: str | None,
     monomers: Path | None = None,
 ) -> dict[str, Any]:  # fmt: skip
     """Roll a molecule and return its line of the table."""
@@ -305,8 +280,6 @@ def molecule(
     pairs = [(k, at["phi", t.residue + 1]) for k, t in enumerate(turns)
              if t.kind == "psi" and ("phi", t.residue + 1) in at]  # fmt: skip
     amino_acids = [name for name in scene.residue_names if name not in ("ACE", "NME")]
-    if correction is not None:
-        counted[1] = [a * correction.weights(turns, amino_acids, x) for a, x in zip(counted[1], of, strict=True)]
     one = densities(md, counted[0]), densities(of, counted[1])
     joint = (joint_densities(md, counted[0], pairs), joint_densities(of, counted[1], pairs)) if pairs else None
     md_ps = bought(scene, md_nm[0][-1], runs[0], files(FRAMES_PS)[0])
@@ -315,7 +288,6 @@ def molecule(
     drawn = monomers and of_monomers(turns, amino_acids, monomers, trained_with(weights.provenance), md)
     if drawn:
         others["library of monomers"] = drawn
-    clock = 1.0 if correction is None else correction.clock
     usual = never(md, rare)
     return {
         "frames": sum(map(len, md)),
@@ -329,10 +301,8 @@ def molecule(
         "equivalent MD time": worst(runs, files(FRAMES_PS)),
         "MD's own, single": float(single(one[0], one[0]).mean()),
         "farthest state": farthest_state(turns, amino_acids, md, of, rare),
-        "free energies of states, kT: error, MD's halves": free_energy_errors(turns, md, of, rare, counted),
-        "MD of the same wall time, ns": len(md) * md_ps * 1e-3,
         "rare φ > 0": [f"{turns[k].kind} {turns[k].residue}" for k in rare],
-        "kinetics": {name: clock * ratio for name, ratio in kinetics(usual, never(of, rare), psi).items()},
+        "kinetics": kinetics(usual, never(of, rare), psi),
         "kinetics of MD's halves": kinetics(usual[::2], usual[1::2], psi),
         "MDGen's recipe": published(scene, md_nm, own_nm) if len(psi) == 3 and len(amino_acids) == 4 else None,
         "lags": lag_errors(md, of, {lag: [angles(turns, x) for x in roll(lag)] for lag in lags}),
@@ -398,18 +368,16 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--weights", required=True)
     parser.add_argument("--test", type=Path, required=True)
     parser.add_argument("--solvent")
-    parser.add_argument("--corrected", type=Path, nargs=2, metavar=("THERE", "HERE"))
     parser.add_argument("--library", type=Path)
     parser.add_argument("--molecules", nargs="+")
     parser.add_argument("-o", "--out", type=Path)
     a = parser.parse_args(arguments)
     weights, rows = load_weights(weights_path(a.weights)), {}
-    correction = Correction.of(*a.corrected) if a.corrected else None
     for place in sorted(a.test.iterdir()):
         runs = sorted(place.glob("run_*.h5"))
         if len(runs) < 4 or (a.molecules and place.name not in a.molecules):
             continue
-        rows[place.name] = molecule(weights, runs, a.folder / place.name, a.solvent, correction, a.library)
+        rows[place.name] = molecule(weights, runs, a.folder / place.name, a.solvent, a.library)
         sys.stdout.write(f"{place.name}: {json.dumps(rows[place.name], ensure_ascii=False)}\n")
         sys.stdout.flush()
     if not rows:

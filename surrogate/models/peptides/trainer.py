@@ -180,7 +180,7 @@ def train_peptides(
                 found.setdefault(f"{name}_{key}", []).append(float(value))
         return {key: float(np.mean(values)) for key, values in found.items()}
 
-    # What only a solvent's own parts were trained for says nothing of the others, and takes nothing from them.
+    # Other solvents than the one whose own parts were tuned are covered as they were.
     domain = peptides_domain(sets, config, start.domain if start is not None and training.tuned == "solvent" else None)
 
     def write(spent_s: list[float]) -> None:
