@@ -1,14 +1,14 @@
 """What implicit data are worth for peptides in explicit water: weights for OBC2 on molecules in TIP3P, in six ways.
 
     python docs/studies/training/peptide_water.py train FOLDER WATER OBC2 [--start W] [--runs 1 4 16]
-               [--methods new solvent whole joint] [--steps 600]
+               [--methods new states whole joint] [--steps 600]
     python docs/studies/training/peptide_water.py table FOLDER WATER OBC2 [--start W]
 
 WATER and OBC2 are folders of `peptide_campaign`: what is in WATER/train is learned from, of each molecule so many runs,
 and what is in WATER/test is rolled as often and as long, from the same first frames. Weights W, for OBC2, are taken as
 they are (`unchanged`); their frames are weighed and their time is stretched as monomers in both solvents say
-(`corrected`, `peptide_correction`); they are trained further, `whole`, or what a solvent has of its own alone
-(`solvent`), or whole on both folders (`joint`); and weights are trained `new`, from nothing. `train` makes
+(`corrected`, `peptide_correction`); they are trained further, `whole`, or the probabilities of `states` alone, or whole
+on both folders (`joint`); and weights are trained `new`, from nothing. `train` makes
 FOLDER/METHOD-RUNS.safetensors, one after the other in one process a core; what is there stays. `table` rolls them all,
 beside MD in both solvents: how far torsions are from MD's in water (`peptide_unseen`, pooled), of every ψ the share of
 time in helices and how often it crosses to the other basin or back, and the pace over that of MD by SIMD replicas on
@@ -46,10 +46,10 @@ from systems.trajectory.codec import open_trajectory
 FloatArray = npt.NDArray[np.float64]
 TABLES = Path(__file__).parents[2] / "results" / "tables"
 # By what follows `peptide_transfer`: whether it goes on from weights, and what is tuned of these.
-TRAINED = {"new": None, "solvent": "solvent", "whole": "all", "joint": "all"}
+TRAINED = {"new": None, "states": "states", "whole": "all", "joint": "all"}
 WORDS = {
     "unchanged": "as they are", "corrected": "reweighted and stretched by monomers", "new": "trained from nothing",
-    "solvent": "the solvent's own parts tuned", "whole": "tuned whole", "joint": "tuned whole, on both solvents",
+    "states": "probabilities of states tuned", "whole": "tuned whole", "joint": "tuned whole, on both solvents",
 }  # fmt: skip
 
 

@@ -5,15 +5,14 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from itertools import combinations
-from typing import NamedTuple
+from typing import NamedTuple, cast
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
 from surrogate.models.peptides import chains
-from surrogate.models.peptides.layout import kinds_of
-from surrogate.models.peptides.model import PeptideSlide, times_apart
+from surrogate.models.peptides.model import PeptideSlide, StateJumps, times_apart
 from surrogate.models.peptides.subjects import PeptideSubject
 
 # Trained by log-likelihood alone, not quite as many frames of equilibrium go one way as the other, and populations err
@@ -50,10 +49,10 @@ class Phi(NamedTuple):
 
 
 class Change(NamedTuple):
-    """Two states of one torsion of a residue: the `kinds` of the residue and of those beside it, which `torsion`, both
+    """Two states of one torsion of a residue: the `types` of the residue and of those beside it, which `torsion`, both
     states, and the logarithm of how many more frames go back from the second than to it."""
 
-    kinds: tuple[int, int, int]
+    types: tuple[int, int, int]
     torsion: int
     states: tuple[int, int]
     lacking: float
@@ -61,34 +60,35 @@ class Change(NamedTuple):
 
 @torch.no_grad()
 def balance(model: PeptideSlide, subjects: Sequence[PeptideSubject]) -> None:
-    """Move the probabilities of changes of `model` to where detailed balance holds in the mean over `subjects`, whose
-    weights say how likely states are; those without weights play no part."""
+    """Move the probabilities of changes of `model` to where detailed balance holds in the mean over `subjects` in each
+    solvent, whose weights say how likely states are; those without weights play no part."""
+    for solvent, jumps in enumerate(model.all_jumps):
+        _balance(model, cast(StateJumps, jumps), [s for s in subjects if s.chain.solvent == solvent])
+
+
+def _balance(model: PeptideSlide, jumps: StateJumps, subjects: Sequence[PeptideSubject]) -> None:
+    """Do so in one solvent."""
     for _ in range(_CHANGES_PASSES):
         found: dict[tuple[int, int, int], list[Change]] = {}
         for change in (change for subject in subjects for change in changes(model, subject)):
             found.setdefault((change.torsion, *change.states), []).append(change)
         for (torsion, a, b), some in found.items():
-            levels = _levels(model, [c.kinds for c in some], [c.lacking for c in some], _CHANGES_RIDGE) / 2
-            model.jumps.raise_change(torsion, a, b, levels)
-            model.jumps.raise_change(torsion, b, a, -levels)
+            levels = _levels(jumps, [c.types for c in some], [c.lacking for c in some], _CHANGES_RIDGE) / 2
+            jumps.raise_change(torsion, a, b, levels)
+            jumps.raise_change(torsion, b, a, -levels)
     phis = [phi for subject in subjects for phi in weighted_phis(model, subject)]
-    kinds = [kinds_of(phi.chain.places, model.config.n_types)[phi.residue].tolist() for phi in phis]
+    types = [phi.chain.places[phi.residue, :3].tolist() for phi in phis]
     for _ in range(_PASSES if phis else 0):
-        model.jumps.raise_change(0, 0, 1, _levels(model, kinds, [lacking_entries(model, phi) for phi in phis], _RIDGE))
+        jumps.raise_change(0, 0, 1, _levels(jumps, types, [lacking_entries(model, phi) for phi in phis], _RIDGE))
 
 
-def _levels(
-    model: PeptideSlide, kinds: Sequence[Sequence[int]], lacking: Sequence[float], ridge: float
-) -> Tensor:  # fmt: skip
-    """Return levels `(3, n_kinds)` of residues, of those before and of those after, whose sums come nearest to what is
-    `lacking` where residues have these `kinds` (n, 3)."""
-    types = torch.zeros(len(kinds), 3, len(model.token_mean), dtype=torch.float64)
-    for of_one, some in zip(types, kinds, strict=True):
-        of_one[range(3), list(some)] = 1.0
-    types = types.flatten(1)
-    held = types.T @ types + ridge * torch.eye(types.shape[1], dtype=torch.float64)
-    found = torch.linalg.solve(held, types.T @ torch.tensor(lacking, dtype=torch.float64).clamp(-_MOST, _MOST))
-    return found.reshape(3, -1).float().to(model.token_mean.device)
+def _levels(jumps: StateJumps, types: Sequence[Sequence[int]], lacking: Sequence[float], ridge: float) -> Tensor:
+    """Return levels `(3, n_types)` of residues, of those before and of those after, whose sums come nearest to what is
+    `lacking` where residues have these `types` (n, 3)."""
+    has = F.one_hot(torch.tensor(types), jumps.of_change.shape[1]).flatten(1).double()
+    held = has.T @ has + ridge * torch.eye(has.shape[1], dtype=torch.float64)
+    found = torch.linalg.solve(held, has.T @ torch.tensor(lacking, dtype=torch.float64).clamp(-_MOST, _MOST))
+    return found.reshape(3, -1).float().to(jumps.of_change.device)
 
 
 @torch.no_grad()
@@ -107,12 +107,12 @@ def changes(model: PeptideSlide, subject: PeptideSubject) -> list[Change]:
         uniform = torch.rand(_FRAMES, 1, *counts.shape, generator=generator).to(observed.device)
         shares = torch.zeros(*uniform.shape, chains.MOST_STATES, device=observed.device)
         apart = times_apart(times, model.config.forgotten_ps)
-        model.jumps.draw(observed, now, chain.places, counts, times, apart, uniform, shares)
+        model.jumps_of(chain).draw(observed, now, chain.places, counts, times, apart, uniform, shares)
         logs.append(torch.einsum("nrka,nrkb->rkab", is_now, shares[:, 0]).clamp(min=1e-6).log())
     flux, held = torch.stack(logs).mean(0), is_now.sum(0)
-    kinds = kinds_of(chain.places, model.config.n_types).tolist()
+    types = chain.places[:, :3].tolist()
     return [
-        Change((*kinds[r],), k, (a, b), float(flux[r, k, b, a] - flux[r, k, a, b]))
+        Change((*types[r],), k, (a, b), float(flux[r, k, b, a] - flux[r, k, a, b]))
         for r, k in torch.nonzero(counts > 1).tolist() if k or r not in chain.signed
         for a, b in combinations(range(int(counts[r, k])), 2) if min(held[r, k, a], held[r, k, b]) >= _LEAST_FRAMES
     ]  # fmt: skip
@@ -162,14 +162,14 @@ def _log_probabilities(model: PeptideSlide, phi: Phi, state: int) -> Tensor:
     """Return the logarithm of how likely, in the mean over frames of one side, a phi is on the other `_TIMES_PS`
     later."""
     observed, now, chain = phi.observed[state], phi.states[state], phi.chain
-    counts, before, found = chain.stated.counts, now[:, None], []
+    jumps, counts, before, found = model.jumps_of(chain), chain.stated.counts, now[:, None], []
     conditioning = chains.conditioning_states(before, counts)
-    common = model.jumps.of_observed(observed, now, chain.places, counts)[:, None]
-    common = common + model.jumps.of_frames(conditioning, conditioning) + model.jumps.of_new_states(conditioning)
+    common = jumps.of_observed(observed, now, chain.places, counts)[:, None]
+    common = common + jumps.of_frames(conditioning, conditioning) + jumps.of_new_states(conditioning)
     for time_ps in _TIMES_PS:
         times = torch.full((len(observed), 1), time_ps, device=observed.device)
         apart = times_apart(times, model.config.forgotten_ps)
-        of_times, levels = model.jumps.of_times_alone(times, apart, chain.places, counts)
-        logits = model.jumps.probabilities(0, common + of_times[:, :, None], levels, before[..., 0], conditioning)
+        of_times, levels = jumps.of_times_alone(times, apart, chain.places, counts)
+        logits = jumps.probabilities(0, common + of_times[:, :, None], levels, before[..., 0], conditioning)
         found.append(logits.softmax(-1)[:, 0, phi.residue, 1 - state].double().mean().log())
     return torch.stack(found)

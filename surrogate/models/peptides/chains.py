@@ -256,6 +256,11 @@ class ChainFeatures:
         return replace(self, code=code, places=places, stated=self.stated.to(device), least_nm=least_nm)
 
     @property
+    def solvent(self) -> int:
+        """Which of the solvents that training saw the chain is in."""
+        return int(self.places[0, 3])
+
+    @property
     def signed(self) -> list[int]:
         """The residues whose phi has two sides, but those before a proline, whose ring leaves them no room."""
         types, residues = (*self.code.layout.types, ""), self.stated.residue[self.stated.slot == 0].tolist()

@@ -311,12 +311,6 @@ class PeptideConfig(ModelConfig):
         return torch.tensor([row[1:-1], row[:-2], row[2:], [at] * len(residues)]).T
 
 
-def kinds_of(places: Tensor, n_types: int) -> Tensor:
-    """`PeptideConfig.places` -> the kinds `(n_residues, 3)` of each residue and its neighbours, a type in a solvent
-    each; without a solvent's column the first is meant."""
-    return places[:, :3] + n_types * places[:, 3:].sum(1, keepdim=True)
-
-
 def chain_features(scene: Scene, config: PeptideConfig, solvent: str | None = None) -> chains.ChainFeatures:
     """Return a peptide's features, in a solvent that training saw (None: the first). Raises InputError as
     `chain_layout`, `resolved` and `PeptideConfig.places` do."""

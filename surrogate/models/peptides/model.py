@@ -22,7 +22,7 @@ from torch.nn import functional as F
 from surrogate.models.lam_slide import flow
 from surrogate.models.layers import ParallelBlock, TimeEmbedding, rotary_angles
 from surrogate.models.peptides.chains import MOST_STATES, MOST_TORSIONS, ChainFeatures, conditioning_states, mended
-from surrogate.models.peptides.layout import PeptideConfig, chain_features, kinds_of
+from surrogate.models.peptides.layout import PeptideConfig, chain_features
 from surrogate.models.propagator import Chunk, Molecule, Propagator, row_by_row
 from systems.chemistry.geometry import superpose
 from systems.errors import InputError
@@ -51,12 +51,11 @@ class StateJumps(nn.Module):
 
     `coupled`, for trainings on many more sequences: neighbours' types count in full, attention over residues mixes what
     the given frame tells, and every other residue sees the new states of those beside it, which are drawn first.
-    Each of several solvents has levels of its own, and scales and shifts what the given frame tells.
     """
 
-    def __init__(self, n_slots: int, n_types: int, *, coupled: bool = False, n_solvents: int = 1) -> None:
+    def __init__(self, n_slots: int, n_types: int, *, coupled: bool = False) -> None:
         super().__init__()
-        self.coupled, self.n_types = coupled, n_types
+        self.coupled = coupled
         n_states = MOST_TORSIONS * MOST_STATES
         self.of_numbers = nn.Linear(n_slots, _WIDTH, bias=False)
         self.of_given = nn.ModuleList(nn.Linear(n_states, _WIDTH, bias=False) for _ in range(3))
@@ -70,11 +69,9 @@ class StateJumps(nn.Module):
         self.hidden = nn.Linear(_WIDTH, _WIDTH)
         self.logits = nn.Linear(_WIDTH, MOST_STATES)
         # Of each type and torsion, from one state to another: a level, and a slope with the logarithm of time.
-        n_kinds = n_types * n_solvents
-        self.of_change = nn.Parameter(torch.zeros(2, n_kinds, MOST_TORSIONS, MOST_STATES, MOST_STATES))
+        self.of_change = nn.Parameter(torch.zeros(2, n_types, MOST_TORSIONS, MOST_STATES, MOST_STATES))
         # And a level of the residue before's type, and of the one after's: proline forbids what others allow.
-        self.beside_change = nn.Parameter(torch.zeros(2, n_kinds, MOST_TORSIONS, MOST_STATES, MOST_STATES))
-        self.of_solvent = solvent_embedding(n_solvents, 2 * _WIDTH)
+        self.beside_change = nn.Parameter(torch.zeros(2, n_types, MOST_TORSIONS, MOST_STATES, MOST_STATES))
         nn.init.zeros_(self.logits.weight)
         nn.init.constant_(self.logits.bias, _RARELY)
         if coupled:
@@ -103,9 +100,6 @@ class StateJumps(nn.Module):
             still = h.new_zeros(len(h), 3, _WIDTH)
             for block in self.blocks:
                 h = block(h[:, None], still, None, bias=bias)[0][:, 0]
-        if self.of_solvent is not None:
-            scale, shift = self.of_solvent(places[0, 3]).chunk(2)
-            h = h * (1.0 + scale) + shift
         return h
 
     def of_new_states(self, conditioning: Tensor) -> Tensor | float:
@@ -127,10 +121,9 @@ class StateJumps(nn.Module):
         logs = torch.stack([times_ps, apart_ps], dim=-1).float().clamp(min=1e-3).log10()
         angles = logs[..., None] * self.waves
         waves = torch.cat([angles.sin(), angles.cos()], dim=-1).flatten(-2)
-        kinds = kinds_of(places, self.n_types)
-        level, slope = (change[kinds[:, 0]].transpose(0, 1) for change in self.of_change)
+        level, slope = (change[places[:, 0]].transpose(0, 1) for change in self.of_change)
         for which, change in enumerate(self.beside_change):
-            level = level + _FAST * change[kinds[:, 1 + which]].transpose(0, 1)
+            level = level + _FAST * change[places[:, 1 + which]].transpose(0, 1)
         absent = torch.arange(MOST_STATES, device=counts.device) >= counts.T[..., None, None].clamp(min=1)
         levels = (level + slope * logs[..., 1, None, None, None, None]).masked_fill(absent, -torch.inf)
         return self.of_times(torch.cat([waves, logs], dim=-1)), levels
@@ -158,8 +151,8 @@ class StateJumps(nn.Module):
 
     @torch.no_grad()
     def raise_change(self, torsion: int, start: int, end: int, levels: Tensor) -> None:
-        """Add `levels` (3, n_types * n_solvents) to the logits of one change, of the residue's kind, of that before and
-        of that after."""
+        """Add `levels` (3, n_types) to the logits of one change, of the residue's type, of that before and of that
+        after."""
         self.of_change[0, :, torsion, start, end] += levels[0]
         self.beside_change[:, :, torsion, start, end] += levels[1:] / _FAST
 
@@ -229,15 +222,6 @@ class StateJumps(nn.Module):
                 found.append(new)
                 now = new
             return torch.cat(found, dim=1)
-
-
-def solvent_embedding(n_solvents: int, width: int) -> nn.Embedding | None:
-    """Return what each of several solvents adds, nothing at first."""
-    if n_solvents < 2:
-        return None
-    table = nn.Embedding(n_solvents, width)
-    nn.init.zeros_(table.weight)
-    return table
 
 
 def times_apart(times_ps: Tensor, forgotten_ps: float) -> Tensor:
@@ -344,7 +328,9 @@ class PeptideFlow(nn.Module):
         self.waves = nn.Buffer(math.pi * torch.linspace(1.0 / _LONGEST_WAVE, 4.0, n_waves), persistent=False)
         self.of_time = nn.Sequential(nn.Linear(2 * n_waves, c.width), nn.SiLU(), nn.Linear(c.width, c.width))
         self.embed_tau = TimeEmbedding(c.width)
-        self.of_solvent = solvent_embedding(len(c.solvents), c.width)
+        self.of_solvent = nn.Embedding(len(c.solvents), c.width) if len(c.solvents) > 1 else None
+        if self.of_solvent is not None:
+            nn.init.zeros_(self.of_solvent.weight)
         self.layers = nn.ModuleList(PeptideLayer(c.width, c.n_heads) for _ in range(c.n_layers))
         self.modulation = nn.Linear(c.width, 6 * c.width)
         self.final_modulation = nn.Linear(c.width, 2 * c.width)
@@ -395,6 +381,8 @@ class PeptideFlow(nn.Module):
 class PeptideSlide(Propagator):
     """The flow between frames of a peptide, behind the contract of `surrogate.models.propagator`.
 
+    The flow serves all solvents. Each has probabilities of states of its own, those of further solvents than the first
+    in `jumps_elsewhere`.
     `token_mean` (kinds, states, slots), `token_scale` (kinds, slots): what makes a coordinate's numbers centred, for
     each state of its torsion where that has states (else all are the first), and of unit variance;
     `correlation` (kinds, lags, slots): with the same coordinate of an earlier frame, at the configuration's lags. A
@@ -417,7 +405,10 @@ class PeptideSlide(Propagator):
         self.usual_steps = config.usual_steps
         n_slots, n_solvents = config.scale.n_slots, max(1, len(config.solvents))
         self.flow = PeptideFlow(config, n_slots)
-        self.jumps = StateJumps(n_slots, config.n_types, coupled=config.coupled, n_solvents=n_solvents)
+        self.jumps, *elsewhere = (
+            StateJumps(n_slots, config.n_types, coupled=config.coupled) for _ in range(n_solvents)
+        )
+        self.jumps_elsewhere = nn.ModuleList(elsewhere)
         self.lag_range_ps = config.shortest_ps, config.longest_ps
         self.lag_ps = config.shortest_ps
         n_kinds = config.n_types * n_solvents
@@ -442,9 +433,18 @@ class PeptideSlide(Propagator):
         centred = chain.code.encode(frames_nm) - self.middle(states, chain)
         return torch.where(chain.code.filled, centred / self.token_scale[self.kinds(chain)], 0.0), states
 
+    @property
+    def all_jumps(self) -> nn.ModuleList:
+        """The probabilities of states in every solvent."""
+        return nn.ModuleList([self.jumps, *self.jumps_elsewhere])
+
+    def jumps_of(self, chain: ChainFeatures) -> StateJumps:
+        """Return the probabilities of states in the solvent that a chain is in."""
+        return cast(StateJumps, self.all_jumps[chain.solvent])
+
     def kinds(self, chain: ChainFeatures) -> Tensor:
         """Return each residue's type in its solvent `(n_residues,)`, as the tables have them."""
-        return kinds_of(chain.places, self.config.n_types)[:, 0]
+        return chain.places[:, 0] + self.config.n_types * chain.solvent
 
     def middle(self, states: Tensor, chain: ChainFeatures) -> Tensor:
         """Return from where numbers count, `(..., n_residues, n_slots)`, in `states` (..., n_residues,
@@ -509,12 +509,12 @@ class PeptideSlide(Propagator):
         drawn = observed.new_zeros(*noise.shape[:2], *filled.shape)
         drawn[..., filled] = noise.flatten(2)[..., : int(filled.sum())].to(observed)
         counts, apart = chain.stated.counts, times_apart(times, self.config.forgotten_ps)
-        shape = (self.n_new, *counts.shape)
+        shape, jumps = (self.n_new, *counts.shape), self.jumps_of(chain)
 
         def draw_states(rows: Tensor, attempt: int) -> Tensor:
             seeds = generators(noise[rows], STATES, attempt)
             uniform = torch.stack([torch.rand(shape, generator=g) for g in seeds]).to(observed)
-            return self.jumps.draw(observed[rows], now[rows], chain.places, counts, times[rows], apart[rows], uniform)
+            return jumps.draw(observed[rows], now[rows], chain.places, counts, times[rows], apart[rows], uniform)
 
         rows = torch.arange(len(observed), device=observed.device)
         states = draw_states(rows, 0)

@@ -55,10 +55,7 @@ JUMPS_SHARE = 0.2
 _JUMPS_BATCH = 128
 # Molecules of which the domain of weights keeps all that is checked.
 _WHOLE = 40
-# What each solvent has of its own, beside means, scales and correlations.
-SOLVENT_PARTS = ("flow.of_solvent.weight", "jumps.of_solvent.weight", "jumps.of_change", "jumps.beside_change")
-TUNED = ("all", "states", "solvent")
-_SOLVENT_RATE = 10.0
+TUNED = ("all", "states")
 # Torsions' numbers vary by at least this: omega's cosine is all but constant, and nothing is learned of its rounding.
 _LEAST_SCALE = 0.05
 
@@ -70,7 +67,8 @@ class PeptideTraining:
     `time_reversal`: windows are read backwards, too, and frames drawn from equilibrium stand for endless times, both
     weighted by a Markov model of each molecule (`models.peptides.subjects`). `positive_phi_kt`: of residue types, the
     free energy of phi > 0 over phi < 0 in kT, which every solvent is taken to have. `tuned`: of weights that training
-    goes on from, 'all', the probabilities of 'states' alone, or what is the 'solvent's own (`SOLVENT_PARTS`).
+    goes on from, 'all', or the probabilities of 'states' alone, in the solvents of the frames: in others such weights
+    stay what they are.
     """
 
     budget_s: float | None = None
@@ -110,8 +108,6 @@ def train_peptides(
         config = replace(start.model.config, usual_steps=kept.usual_steps, usual_solver=kept.usual_solver,
                          coupled=start.model.config.coupled or config.coupled)  # fmt: skip
     config = with_scale(in_solvents(config, sets, start), sets)
-    if training.tuned == "solvent" and not config.solvents:
-        raise InputError("`tuned='solvent'` is for frames in another solvent than that of the weights.")
     device = torch.device(training.device)
     model = PeptideSlide(config).to(device)
     subjects, held_out = (
@@ -125,17 +121,12 @@ def train_peptides(
     if training.time_reversal:
         subjects = [subject.in_equilibrium(training.positive_phi_kt) for subject in subjects]
     of_jumps = 1.0 if training.tuned == "states" else JUMPS_SHARE
-    for name, p in model.named_parameters():
-        p.requires_grad_(training.tuned != "solvent" or name in SOLVENT_PARTS)
     flow_s, jumps_s = (
         None if training.budget_s is None else share * training.budget_s for share in (1 - of_jumps, of_jumps)
     )
-    rate = training.learning_rate
-    # What a solvent has of its own are few numbers, far from where they end. Decay would move those of others, too.
-    rate, decay = (_SOLVENT_RATE * rate, 0.0) if training.tuned == "solvent" else (rate, StageConfig.weight_decay)
     shared = StageConfig(
-        "flow", training.batch, rate, flow_s, training.steps, seed=training.seed, bf16=training.bf16,
-        validate_every_s=training.validate_every_s, weight_decay=decay,
+        "flow", training.batch, training.learning_rate, flow_s, training.steps, seed=training.seed, bf16=training.bf16,
+        validate_every_s=training.validate_every_s,
     )  # fmt: skip
     stages = (shared, replace(shared, name="jumps", batch=_JUMPS_BATCH, budget_s=jumps_s, bf16=False))
     n_held = min(_HELD_WINDOWS, max(_LEAST_HELD, _HELD_IN_ALL // (len(subjects) + len(held_out))))
@@ -180,8 +171,7 @@ def train_peptides(
                 found.setdefault(f"{name}_{key}", []).append(float(value))
         return {key: float(np.mean(values)) for key, values in found.items()}
 
-    # Other solvents than the one whose own parts were tuned are covered as they were.
-    domain = peptides_domain(sets, config, start.domain if start is not None and training.tuned == "solvent" else None)
+    domain = peptides_domain(sets, config, start.domain if start is not None and training.tuned == "states" else None)
 
     def write(spent_s: list[float]) -> None:
         settings: dict[str, Any] = {"seed": training.seed, "spent_s": round(sum(spent_s), 1)}
@@ -190,7 +180,7 @@ def train_peptides(
         save_weights(out, model, domain, provenance_of(FrameSets(tuple(sets)).origin, settings, start))
 
     def in_turn() -> Iterator[Stage]:
-        for stage, trained, loss_fn in zip(stages, (model.flow, model.jumps), (flow_loss, jumps_loss), strict=True):
+        for stage, trained, loss_fn in zip(stages, (model.flow, model.all_jumps), (flow_loss, jumps_loss), strict=True):
             if stage.name == "jumps" or training.tuned != "states":
                 yield Stage(trained, stage, loss_fn, partial(validate, stage))
         balance(model, subjects)
@@ -271,11 +261,10 @@ def _go_on_from(start: PeptideSlide, model: PeptideSlide) -> None:
     whole = model.state_dict()
     with torch.no_grad():
         for name, tensor in start.state_dict().items():
-            # New numbers come after those of `start`, new solvents after its own.
+            # New numbers come after those of `start`, new solvents after its own, which begin as its first.
             whole[name][tuple(slice(n) for n in tensor.shape)] = tensor
-        n, n_types = len(start.token_mean), model.config.n_types
-        for change in (model.jumps.of_change, model.jumps.beside_change):
-            change[:, n:] = change[:, torch.arange(n, change.shape[1], device=change.device) % n_types]
+    for jumps in list(model.all_jumps)[len(start.all_jumps) :]:
+        jumps.load_state_dict(model.jumps.state_dict())
     assert start.config.scale is not None and model.config.scale is not None
     for key in model.config.scale.slots.keys() - start.config.scale.slots.keys():
         places = _places(model.config, key)
@@ -417,7 +406,7 @@ def state_loss(
     if noisy:
         observed = disturbed(observed, chain, model.config, generator)
     apart = times_apart(times_ps, model.config.forgotten_ps)
-    return model.jumps.loss(observed, states, chain.places, chain.stated.counts, times_ps, apart, share)
+    return model.jumps_of(chain).loss(observed, states, chain.places, chain.stated.counts, times_ps, apart, share)
 
 
 def disturbed(

@@ -71,6 +71,21 @@ def test_as_many_frames_change_one_way_as_the_other() -> None:
     torch.testing.assert_close(moved[:, 0, 1], -moved[:, 1, 0])
 
 
+def test_a_solvent_is_balanced_by_frames_in_it() -> None:
+    frames = _frames("ACE-ALA-NME", kind="psi")
+    config = PeptideConfig(width=16, n_layers=1, n_heads=1, chunk_frames=4, solvents=("obc2", "tip3p"))
+    config = with_scale(config, [frames])
+    wet = PeptideSubject(frames, chain_features(frames.scene, config, "tip3p"), np.repeat([1.6, 0.4], EACH))
+    torch.manual_seed(0)
+    model = PeptideSlide(config).requires_grad_(False)
+    dry, water = model.jumps.of_change.clone(), model.jumps_elsewhere[0].of_change.clone()
+    before = [abs(change.lacking) for change in changes(model, wet)]
+    balance(model, [wet])
+    assert torch.equal(model.jumps.of_change, dry)
+    assert not torch.equal(model.jumps_elsewhere[0].of_change, water)
+    assert max(abs(change.lacking) for change in changes(model, wet)) < 0.5 * max(before)
+
+
 def test_how_likely_the_rare_side_is_sets_the_probabilities() -> None:
     frames = _frames("ACE-ALA-NME")
     config = with_scale(PeptideConfig(width=16, n_layers=1, n_heads=1, chunk_frames=4), [frames])

@@ -21,7 +21,6 @@ from surrogate.models.peptides.layout import ENDS, PeptideConfig, chain_features
 from surrogate.models.peptides.model import PeptideSlide
 from surrogate.models.peptides.subjects import PeptideSubject
 from surrogate.models.peptides.trainer import (
-    SOLVENT_PARTS,
     PeptideTrainer,
     PeptideTraining,
     normalise,
@@ -393,19 +392,16 @@ def test_weights_of_two_solvents_know_which_is_meant(frames: TrainingFrames, tmp
     wet = in_water(frames)
     first = load_weights(train_peptides([frames], tmp_path / "a.safetensors", SMALL, PeptideTraining(steps=2)))
     assert first.model.config.solvents == () and first.model.flow.of_solvent is None
-    alone = PeptideTraining(steps=2, tuned="solvent")
-    with pytest.raises(InputError, match="another solvent than that of the weights"):
-        train_peptides([frames], tmp_path / "no.safetensors", SMALL, alone, start=first)
     found = {
         tuned: load_weights(
             train_peptides([wet], tmp_path / f"{tuned}.safetensors", SMALL,
                            PeptideTraining(steps=20, tuned=tuned), start=first)
         )
-        for tuned in ("solvent", "all")
+        for tuned in ("states", "all")
     }  # fmt: skip
-    model, n = found["solvent"].model, len(first.model.token_mean)
+    model, n = found["states"].model, len(first.model.token_mean)
     assert model.config.solvents == ("obc2", "tip3p") and len(model.token_mean) == 2 * n
-    # What was known of the first solvent stays, and only what is the other's own has moved.
+    # What was known of the first solvent stays, and the flow too where only states are trained.
     for name in ("token_mean", "token_scale", "correlation"):
         assert torch.equal(getattr(model, name)[:n], getattr(first.model, name))
     before = dict(first.model.named_parameters())
@@ -416,12 +412,12 @@ def test_weights_of_two_solvents_know_which_is_meant(frames: TrainingFrames, tmp
         }
         for tuned, one in found.items()
     }  # fmt: skip
-    assert moved["solvent"] <= set(SOLVENT_PARTS) < moved["all"] | set(SOLVENT_PARTS)
-    assert all(bool(model.get_parameter(name)[-1].any()) for name in SOLVENT_PARTS[:2])
-    change, was = model.jumps.of_change, first.model.jumps.of_change
-    assert torch.equal(change[:, :n], was) and not torch.equal(change[:, n:], was)
+    assert not moved["states"] and moved["all"] and all(name.startswith("flow") for name in moved["all"])
+    (elsewhere,) = model.jumps_elsewhere
+    assert not torch.equal(elsewhere.of_change, first.model.jumps.of_change)
+    assert bool(found["all"].model.flow.of_solvent.weight[-1].any())
     covered = {tuned: [m.conditions["solvent"] for m in one.domain.members] for tuned, one in found.items()}
-    assert covered == {"solvent": ["obc2", "tip3p"], "all": ["tip3p"]}
+    assert covered == {"states": ["obc2", "tip3p"], "all": ["tip3p"]}
     # Residue types that are not in the water data have there what they have elsewhere.
     ala, gone = (n + (*ENDS, *model.config.types).index(name) for name in ("ALA", "NME"))
     assert float((model.token_scale[ala] / model.token_scale[ala - n]).median()) > 1.5

@@ -3,6 +3,7 @@ frames set right by small turns: torsions mirrored at the end of their states, o
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -216,14 +217,14 @@ def test_rates_of_two_residue_types_are_learned() -> None:
 
 
 def _middles(model: PeptideSlide, chain: ChainFeatures) -> torch.Tensor:
-    """Return means `(types, states, slots)` that are the middles of states."""
+    """Return means `(kinds, states, slots)` that are the middles of states."""
     found = torch.zeros_like(model.token_mean)
     for residue, slot, middles in zip(
         chain.stated.residue.tolist(), chain.stated.slot.tolist(), chain.stated.middles_deg.deg2rad(), strict=True
     ):
         at = int(torch.nonzero(chain.state_at[residue] == slot)[0])
-        found[chain.places[residue, 0], :, at] = middles.cos()
-        found[chain.places[residue, 0], :, at + 1] = middles.sin()
+        kind = model.kinds(chain)[residue]
+        found[kind, :, at], found[kind, :, at + 1] = middles.cos(), middles.sin()
     return found
 
 
@@ -281,6 +282,30 @@ def test_states_in_which_atoms_always_overlap_are_drawn_again(monkeypatch: pytes
     stayed = (chain.states(chunk.frames_nm)[..., 1, 1] == own).all(1).float().mean()
     assert 0.35 < stayed < 0.65 if not again else stayed > 0.9
     assert chunk.evaluations > 2 * (1.5 if again else 4)
+
+
+def test_each_solvent_has_probabilities_of_its_own() -> None:
+    """Psi changes as often as not in water, and never in OBC2."""
+    scene = build_peptide("ACE-ALA-NME")
+    torch.manual_seed(0)
+    model = PeptideSlide(replace(_config(scene), solvents=("obc2", "tip3p"))).eval().requires_grad_(False)
+    model.lag_ps = 1000.0
+    for jumps in model.all_jumps:
+        jumps.logits.bias[:] = -30.0
+    model.jumps_elsewhere[0].of_change[0, :, 1] = 30.0
+    last = torch.tensor(scene.positions_nm).float().expand(64, 1, -1, -1)
+    noise = torch.randn(64, *model.noise_shape(scene.n_atoms), generator=torch.Generator().manual_seed(3))
+    stayed = {}
+    for solvent in ("obc2", "tip3p"):
+        model.solvent = solvent
+        molecule = model.featurise(scene)
+        chain = molecule.own
+        assert chain is not None
+        model.token_scale.fill_(0.01)
+        model.token_mean.copy_(_middles(model, chain))
+        frames = model.next_chunk(last, molecule, noise, solver_steps=2).frames_nm
+        stayed[solvent] = float((chain.states(frames) == chain.states(last[0, 0])).flatten(1).all(1).float().mean())
+    assert stayed["obc2"] == 1.0 and 0.35 < stayed["tip3p"] < 0.65
 
 
 def test_atoms_overlap_where_they_are_nearer_than_md_lets_them_and_no_few_bonds_apart() -> None:
