@@ -8,8 +8,8 @@ states: sixteen replicas in OBC2, 100 ps at 500 K and 100 ps at 300 K. In water 
 1 ps apart without water) the replicas are turned to the torsions of these; in OBC2 (the wide campaign, frames 5 ps
 apart) they go on from them, those of `fine` 300 ps long and frames 1 ps apart. The first 25 ps in water and 50 ps in
 OBC2 are left out. In OBC2 half of the tests come first and the other half last; in water the residues that the first
-tests are made of, these tests, the other monomers, pairs with every residue once at either place, further tests and
-pairs and chains, then more runs of all. What is there is left alone and what was stopped goes on.
+tests are made of, these tests, the other monomers, the capped tests again, pairs with every residue once at either
+place, further tests and pairs and chains, then more runs of all. What is there is left alone and what was stopped goes on.
 """
 
 from __future__ import annotations
@@ -138,10 +138,11 @@ def order(solvent: str) -> list[tuple[str, Peptide, int]]:
     # What the first tests are made of comes before them, so that a model of theirs can be trained at once.
     monomers.sort(key=lambda peptide: peptide.residues[0] not in tested)
     n, m = len(tested), len(RESIDUES)
-    parts = (("train", monomers[:n]), ("test", TEST), ("train", (*monomers[n:], *others[:m])),
-             ("test", FURTHER_TEST), ("train", others[m:]))  # fmt: skip
+    again = [peptide for peptide in TEST if peptide.capped]
+    parts = (("train", monomers[:n], 0), ("test", TEST, 0), ("train", monomers[n:], 0), ("test", again, 1),
+             ("train", others[:m], 0), ("test", FURTHER_TEST, 0), ("train", others[m:], 0))  # fmt: skip
     return [
-        *((kind, peptide, 0) for kind, some in parts for peptide in some),
+        *((kind, peptide, number) for kind, some, number in parts for peptide in some),
         *(("train", peptide, number) for number in range(1, ROUNDS) for peptide in training),
     ]
 
