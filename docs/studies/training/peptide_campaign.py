@@ -24,7 +24,15 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from peptide_list import FIRST_TESTS, RESIDUES, Peptide, training_peptides, unseen_peptides, wide_peptides
+from peptide_list import (
+    FIRST_TESTS,
+    RESIDUES,
+    Peptide,
+    held_out_peptides,
+    training_peptides,
+    unseen_peptides,
+    wide_peptides,
+)
 from processes import arguments_of, in_order, only_here, parts_of, run_path, simulate_runs
 
 from md_reference.forces.forcefield import build_system
@@ -125,7 +133,9 @@ def batch(folder: Path, peptide: Peptide, number: int, solvent: str, every_ps: f
 def order(solvent: str) -> list[tuple[str, Peptide, int]]:
     """Return every batch: where its files go, the molecule and the number."""
     if solvent == IMPLICIT.solvent:
-        tests, train = unseen_peptides(), wide_peptides()
+        in_water, known = {p.name for p in TEST}, {p.name for p in unseen_peptides()}
+        tests = (*unseen_peptides(), *(p for p in held_out_peptides() if p.name in in_water - known))
+        train = wide_peptides()
         tested = {p.residues for p in tests if len(p.residues) > 1}
         round_one = training_peptides()[: 2 * len(RESIDUES)]
         fine = [replace(p, time_ps=FINE_PS) for p in round_one if p.residues not in tested]
