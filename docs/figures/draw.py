@@ -1,6 +1,7 @@
 """Draw the figures of README and manual: `python docs/figures/draw.py [DEMO_FOLDER]`.
 
-`effective_samples.svg` and `n_body_causes.svg` are made of the tables of their names in docs/results/tables;
+`effective_samples.svg`, `n_body_causes.svg` and `peptides_water.svg` are made of the tables of their names in
+docs/results/tables;
 `overlay.png` of the trajectories that `surromd demo` left in DEMO_FOLDER, and left as it is without one.
 """
 
@@ -95,6 +96,39 @@ def draw_n_body(table: dict[str, Any], out: Path) -> None:
     plt.close(figure)
 
 
+def draw_water(rates: dict[str, Any], populations: dict[str, Any], out: Path) -> None:
+    """Draw how often psi crosses over MD's, and how far torsions are from MD's, against the MD in water that each way
+    of training learned from; grey: MD's own standard error."""
+    figure, both = plt.subplots(1, 2, figsize=(7.4, 3.2), layout="constrained", sharex=True)
+    rows = {(row[0], row[1]): (numbers(row[-1]), float(other[2]))
+            for row, other in zip(rates["rows"], populations["rows"], strict=True)}  # fmt: skip
+    _, low, high = rows.pop((rates["rows"][0][0], ""))[0]
+    both[0].axhspan(low, high, color="0.9")
+    implicit = rows.pop((rates["rows"][1][0], ""))
+    least = min(float(ns) for _, ns in rows if float(ns))
+    for axes, value, label in ((both[0], implicit[0][0], "MD in OBC2"), (both[1], implicit[1], None)):
+        axes.axhline(1.0, color="black", lw=0.8, zorder=0)
+        axes.axhline(value, color="black", lw=0.8, ls=":", label=label, zorder=0)
+    for k, name in enumerate(dict.fromkeys(name for name, _ in rows)):
+        some = sorted((float(ns) or least / 4, *found) for (what, ns), found in rows.items() if what == name)
+        x = np.array([ns for ns, *_ in some]) * 1.03 ** (k - 2)
+        y = np.array([found for _, found, _ in some])
+        style = {"marker": "o", "ms": 4, "lw": 1, "color": f"C{k}"}
+        both[0].errorbar(x, y[:, 0], [y[:, 0] - y[:, 1], y[:, 2] - y[:, 0]], capsize=2, label=name, **style)
+        both[1].plot(x, [apart for *_, apart in some], **style)
+    both[0].set(ylabel="ψ crossings over MD's", yscale="log", yticks=(0.5, 1, 2, 4, 8), yticklabels=(0.5, 1, 2, 4, 8))
+    both[0].minorticks_off()
+    both[1].set(ylabel="distance of torsions over MD's own")
+    ticks = sorted({float(ns) for _, ns in rows} - {0.0})
+    for axes in both:
+        axes.set(xscale="log", xlabel="MD of monomers in water, ns", xticks=[least / 4, *ticks],
+                 xticklabels=["0", *(f"{t:g}" for t in ticks)])  # fmt: skip
+        axes.minorticks_off()
+    figure.legend(*both[0].get_legend_handles_labels(), loc="outside lower center", ncols=3, fontsize=8, frameon=False)
+    figure.savefig(out, metadata={"Date": None})
+    plt.close(figure)
+
+
 def dihedrals(paths: list[Path]) -> tuple[np.ndarray, np.ndarray, float]:
     """Return φ and ψ (n_frames,) in degrees of all frames of trajectories of one peptide with one residue of each, and
     the time (ns) that they cover."""
@@ -149,5 +183,8 @@ def draw_overlay(demo: Path, out: Path) -> None:
 if __name__ == "__main__":
     draw_effective(json.loads(TABLE.read_text(encoding="utf-8")), HERE / "effective_samples.svg")
     draw_n_body(json.loads(CAUSES.read_text(encoding="utf-8")), HERE / "n_body_causes.svg")
+    water = [json.loads(TABLE.with_name(name).read_text(encoding="utf-8"))
+             for name in ("peptides_water.json", "peptides_water_helices.json")]  # fmt: skip
+    draw_water(*water, HERE / "peptides_water.svg")
     if len(sys.argv) > 1:
         draw_overlay(Path(sys.argv[1]), HERE / "overlay.png")

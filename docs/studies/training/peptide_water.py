@@ -11,8 +11,8 @@ they are (`unchanged`); their frames are weighed and their time is stretched as 
 on both folders (`joint`); and weights are trained `new`, from nothing. `train` makes
 FOLDER/METHOD-RUNS.safetensors, one after the other in one process a core; what is there stays. `table` rolls them all,
 beside MD in both solvents: how far torsions are from MD's in water (`peptide_unseen`, pooled), of every ψ the share of
-time in helices and how often it crosses to the other basin or back, and the pace over that of MD by SIMD replicas on
-the same core.
+time in helices and how often it crosses to the other basin or back, this over MD's in the geometric mean, and the pace
+over that of MD by SIMD replicas on the same core.
 """
 
 from __future__ import annotations
@@ -108,8 +108,12 @@ class Molecule(NamedTuple):
     @property
     def psi(self) -> dict[str, int]:
         """Every ψ, by what it is called in a table."""
-        return {f"ψ of {self.residues[t.residue]} ({self.name})": k
-                for k, t in enumerate(self.turns) if t.kind == "psi"}  # fmt: skip
+        free = " (free)" if self.name.startswith("free-") else ""
+        return {f"ψ {self.residues[t.residue]}{free}": k for k, t in enumerate(self.turns) if t.kind == "psi"}
+
+    def crossings(self, runs: Sequence[FloatArray], k: int, clock: float = 1.0) -> FloatArray:
+        """Return how often the ψ at a place crosses, and the time in ns, of each run `(n_runs, 2)`."""
+        return np.array([[psi_crossings(x[:, k]), 1e-3 * FRAMES_PS * len(x) * clock] for x in runs])
 
     def apart(self, runs: Sequence[FloatArray], weights: Sequence[FloatArray]) -> float:
         """Return how far torsions are from MD's in water, pooled, over MD's own; a φ > 0 that MD hardly enters plays no
@@ -133,18 +137,25 @@ def with_error(of: Callable[[list[int]], float], n: int) -> str:
 
 
 def row(
-    words: str, ns: str, of: Sequence[tuple[Molecule, list[FloatArray], list[FloatArray]]], clock: float = 1.0
-) -> list[str]:  # fmt: skip
-    """Return a line of the table: of each molecule runs, and what their frames count."""
+    words: str, learned: str, of: Sequence[tuple[Molecule, list[FloatArray], list[FloatArray]]], clock: float = 1.0
+) -> tuple[list[str], list[str]]:  # fmt: skip
+    """Return a line of both tables, of crossings and of populations, of weights that `learned` so many ns: of each
+    molecule runs, and what their frames count."""
     apart = [molecule.apart(runs, weights) for molecule, runs, weights in of]
-    helices, often = [], []
+    helices, often, ratios = [], [], []
     for molecule, runs, weights in of:
         for k in molecule.psi.values():
             alpha = np.array([[(w * is_alpha(x[:, k])).sum(), w.sum()] for x, w in zip(runs, weights, strict=True)])
-            count = np.array([[1e3 * psi_crossings(x[:, k]) / clock, FRAMES_PS * len(x)] for x in runs])
+            count, of_md = molecule.crossings(runs, k, clock), molecule.crossings(molecule.md, k)
             for found, each, factor in ((helices, alpha, 100.0), (often, count, 1.0)):
                 found.append(with_error(lambda some, e=each, f=factor: f * np.divide(*e[some].sum(axis=0)), len(runs)))
-    return [words, ns, f"{np.mean(apart):.2f}", *helices, *often]
+            # Half a crossing more, for those never seen; counts scatter as Poisson's.
+            (n, ns), (n_md, ns_md) = (x.sum(axis=0) + (0.5, 0.0) for x in (count, of_md))
+            ratios.append((math.log(n / ns / n_md * ns_md), 1.0 / n + (1.0 / n_md if runs is not molecule.md else 0.0)))
+    logs, variances = np.array(ratios).T
+    error = math.sqrt(variances.sum()) / len(logs)
+    mean, low, high = (f"{math.exp(logs.mean() + k * error):.2f}" for k in (0, -1, 1))
+    return [words, learned, *often, f"{mean} [{low}, {high}]"], [words, learned, f"{np.mean(apart):.2f}", *helices]
 
 
 def make_table(folder: Path, water: Path, obc2: Path, start: str, out: Path) -> None:
@@ -170,35 +181,36 @@ def make_table(folder: Path, water: Path, obc2: Path, start: str, out: Path) -> 
                for m, runs in zip(tests, unchanged, strict=True)]  # fmt: skip
     ns = f"{simulated_ns(water / 'train', n_replicas()):.0f}"
     lines = [
-        [*row("MD in TIP3P", "", even([m.md for m in tests])), "1"],
-        [*row("MD in OBC2", "", even([m.in_obc2 for m in tests])), ""],
-        [*row(WORDS["unchanged"], "0", even(unchanged)), faster],
-        [*row(WORDS["corrected"], ns, weighed, correction.clock), faster],
+        (*row("MD in TIP3P", "", even([m.md for m in tests])), "1"),
+        (*row("MD in OBC2", "", even([m.in_obc2 for m in tests])), ""),
+        (*row(WORDS["unchanged"], "0", even(unchanged)), faster),
+        (*row(WORDS["corrected"], ns, weighed, correction.clock), faster),
     ]
     made = {(list(TRAINED).index(path.stem.split("-")[0]), int(path.stem.split("-")[1])): path
             for path in folder.glob("*-*.safetensors") if is_trained(path)}  # fmt: skip
     for (k, n), path in sorted(made.items()):
         method = list(TRAINED)[k]
         runs, faster = roll(path, "tip3p" if TRAINED[method] else None)
-        lines.append([*row(WORDS[method], f"{simulated_ns(water / 'train', n):.0f}", even(runs)), faster])
+        lines.append((*row(WORDS[method], f"{simulated_ns(water / 'train', n):.0f}", even(runs)), faster))
     named = [name for m in tests for name in m.psi]
     about = {
         "command": f"python docs/studies/training/peptide_water.py table FOLDER WATER OBC2 --start {start}",
         "machine": machine_name(),
     }
+    each = "; ".join(f"{len(m.md)} runs of {1e-3 * m.time_ps:.2g} ns of {m.name}" for m in tests)
     note = (
-        f"{len(tests[0].md)} runs of {1e-3 * tests[0].time_ps:.2g} ns of each molecule, rollouts from the first frames "
-        f"of MD in TIP3P, MD in OBC2 longer; errors over runs. Stretched by {correction.clock:.1f}."
+        f"{each}. Rollouts from the first frames of MD in TIP3P; MD in OBC2 is longer. Errors over runs, of the "
+        f"geometric mean by counts. Stretched by {correction.clock:.1f}."
     )
-    n = 3 + len(named)
     for path, columns, rows in (
-        (out, [*named, "faster than MD, times"], [[*line[:2], *line[n:]] for line in lines]),
-        (out.with_stem(f"{out.stem}_helices"), ["torsions, pooled", *named], [line[:n] for line in lines]),
-    ):
-        table = {"columns": ["weights for OBC2", "MD in water, ns", *columns], "rows": rows, **about, "note": note}
+        (out, [*named, "over MD's"], [of_rates for of_rates, *_ in lines]),
+        (out.with_stem(f"{out.stem}_helices"), ["torsions, pooled", *named, "faster than MD"],
+         [[*of_helices, pace] for _, of_helices, pace in lines]),
+    ):  # fmt: skip
+        table = {"columns": ["weights for OBC2", "MD, ns", *columns], "rows": rows, **about, "note": note}
         path.write_text(json.dumps(table, ensure_ascii=False, indent=1) + "\n", "utf-8")
-    for line in lines:
-        sys.stdout.write(" | ".join(line) + "\n")
+        for line in rows:
+            sys.stdout.write(" | ".join(line) + "\n")
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
