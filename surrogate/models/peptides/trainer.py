@@ -115,9 +115,13 @@ def train_peptides(
         for some in (sets, unseen)
     )
     normalise(model, subjects, training.seed)
+    measured = [kind for subject in subjects for kind in model.kinds(subject.chain).tolist()]
     if start is not None:
-        _go_on_from(cast(PeptideSlide, start.model), model)
-    _fill_unseen(model, subjects)
+        known = cast(PeptideSlide, start.model)
+        _go_on_from(known, model)
+        # A flow that stays needs the means and scales that it was trained with.
+        measured = [*range(len(known.token_mean)), *(measured if training.tuned == "all" else ())]
+    _fill_unseen(model, measured)
     if training.time_reversal:
         subjects = [subject.in_equilibrium(training.positive_phi_kt) for subject in subjects]
     of_jumps = 1.0 if training.tuned == "states" else JUMPS_SHARE
@@ -272,11 +276,11 @@ def _go_on_from(start: PeptideSlide, model: PeptideSlide) -> None:
             getattr(model, name)[places] = own[name][places]
 
 
-def _fill_unseen(model: PeptideSlide, subjects: Sequence[PeptideSubject]) -> None:
-    """Give residue types that no peptide shows in a solvent the numbers that they have in the first."""
+def _fill_unseen(model: PeptideSlide, seen: Sequence[int]) -> None:
+    """Give residue types in a further solvent that are not among those `seen` the numbers that they have in the
+    first."""
     n_types = model.config.n_types
-    seen = {*range(n_types), *(kind for subject in subjects for kind in model.kinds(subject.chain).tolist())}
-    for kind in set(range(len(model.token_mean))) - seen:
+    for kind in set(range(n_types, len(model.token_mean))) - set(seen):
         for table in (model.token_mean, model.token_scale, model.correlation):
             table[kind] = table[kind % n_types]
 

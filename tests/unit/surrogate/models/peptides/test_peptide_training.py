@@ -418,7 +418,9 @@ def test_weights_of_two_solvents_know_which_is_meant(frames: TrainingFrames, tmp
     assert bool(found["all"].model.flow.of_solvent.weight[-1].any())
     covered = {tuned: [m.conditions["solvent"] for m in one.domain.members] for tuned, one in found.items()}
     assert covered == {"states": ["obc2", "tip3p"], "all": ["tip3p"]}
+    assert torch.equal(model.token_scale[n:], model.token_scale[:n]), "as the flow, which stays, was trained with"
     # Residue types that are not in the water data have there what they have elsewhere.
+    model = found["all"].model
     ala, gone = (n + (*ENDS, *model.config.types).index(name) for name in ("ALA", "NME"))
     assert float((model.token_scale[ala] / model.token_scale[ala - n]).median()) > 1.5
     assert torch.equal(model.token_mean[n], model.token_mean[0]) and not torch.equal(
