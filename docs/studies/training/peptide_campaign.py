@@ -9,8 +9,8 @@ states: sixteen replicas in OBC2, 100 ps at 500 K and 100 ps at 300 K. In water 
 apart) they go on from them, those of `fine` 300 ps long and frames 1 ps apart. The first 25 ps in water and 50 ps in
 OBC2 are left out. In OBC2 half of the tests come first and the other half last; in water the residues that the first
 tests are made of, these tests, the other monomers, two pairs with free ends and two without, the capped tests again,
-pairs with every residue once at either place, further tests and pairs and chains, then more runs of all. What is there is left alone and what was
-stopped goes on.
+pairs with every residue once at either place, further tests and pairs and chains, then more runs of all. What is there
+is left alone and what was stopped goes on.
 """
 
 from __future__ import annotations
