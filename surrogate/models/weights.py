@@ -96,10 +96,15 @@ class TrainingDomain:
         empty = ("jumps", "further", "sequences", "transferable", "chemistry")
         return {key: value for key, value in out.items() if value or key not in empty}
 
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The molecules, each once."""
+        members = self.members
+        return tuple(dict.fromkeys([*(d.scene.name for d in members), *(s for d in members for s in d.sequences)]))
+
     def describe(self) -> str:
         """One line for people: 'alanine-dipeptide (C6H12N2O2, 22 atoms), ff14SB/obc2, 300 K, frames 1 ps apart'."""
-        c, names = self.conditions, [domain.scene.name for domain in self.members]
-        names += [sequence for domain in self.members for sequence in domain.sequences]
+        c, names = self.conditions, self.names
         lags = f"{self.lag_ps:g}" + (f" to {self.longest_lag_ps:g}" if self.jumps else "")
         what = f"{self.scene.name} ({self.scene.formula}, {self.scene.n_atoms} atoms)"
         if self.further:
@@ -107,7 +112,8 @@ class TrainingDomain:
             what = f"{len(names)} molecules ({', '.join(names[:6])}{more})"
         what += " and molecules like them" if self.transferable else ""
         what = what if self.chemistry is None else self.chemistry.describe()
-        md = f"{f}/{c.get('solvent')}, {c.get('temperature_k')} K" if (f := c.get("force_field")) else "unknown MD"
+        solvents = " or ".join(dict.fromkeys(str(domain.conditions.get("solvent")) for domain in self.members))
+        md = f"{f}/{solvents}, {c.get('temperature_k')} K" if (f := c.get("force_field")) else "unknown MD"
         return f"{what}, {md}, frames {lags} ps apart"
 
 

@@ -176,26 +176,30 @@ def _windows(path: Path) -> dict[str, Any]:
 
 def _weights(path: Path) -> dict[str, Any]:
     from surrogate.models.weights import load_weights
+    from surrogate.sampling.domain import domain_under
 
     weights = load_weights(path)
+    domain, solvents = weights.domain, getattr(weights.model.config, "solvents", ())
     n_parameters = sum(p.numel() for p in weights.model.parameters())
     return {
         "file": str(path),
         "type": "weights",
-        "summary": f"{n_parameters / 1e6:.2f} M parameters for {weights.domain.describe()}",
+        "summary": f"{n_parameters / 1e6:.2f} M parameters for {domain.describe()}",
         "arch": weights.model.arch,
         "hash": weights.hash,
         "parameters": n_parameters,
-        "scene": weights.domain.scene.name,
-        "formula": weights.domain.scene.formula,
-        "molecules": [
-            *(f"{d.scene.name} ({d.scene.formula})" for d in weights.domain.members),
-            *(sequence for d in weights.domain.members for sequence in d.sequences),
-        ],
-        "covers_unseen_molecules": weights.domain.transferable,
-        "lag_ps": weights.domain.lag_ps,
-        "longest_lag_ps": weights.domain.longest_lag_ps,
-        "conditions": weights.domain.conditions,
+        "scene": domain.scene.name,
+        "formula": domain.scene.formula,
+        "molecules": list(domain.names),
+        "covers_unseen_molecules": domain.transferable,
+        **(
+            {"solvents": {s: domain_under(domain, {"solvent": s}, path.name).describe() for s in solvents}}
+            if solvents
+            else {}
+        ),
+        "lag_ps": domain.lag_ps,
+        "longest_lag_ps": domain.longest_lag_ps,
+        "conditions": domain.conditions,
         "config": weights.model.config.to_dict(),
         "provenance": weights.provenance,
         "size_mb": path.stat().st_size / 1e6,

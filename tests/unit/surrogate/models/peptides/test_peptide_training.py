@@ -431,6 +431,9 @@ def test_weights_of_two_solvents_know_which_is_meant(frames: TrainingFrames, tmp
 def test_a_rollout_says_in_which_solvent_of_its_weights(frames: TrainingFrames, tmp_path: Path) -> None:
     wet = in_water(frames)
     both = train_peptides([frames, wet], tmp_path / "w.safetensors", SMALL, PeptideTraining(steps=2))
+    told = sm.info(both)
+    assert told["molecules"] == ["ACE-ALA-NME"] and "obc2 or tip3p" in told["summary"]
+    assert "ff14SB/tip3p" in told["solvents"]["tip3p"]
     deviations = {}
     for solvent in (None, "obc2", "tip3p"):
         out = tmp_path / f"{solvent}.h5"
