@@ -191,6 +191,10 @@ def rollout(
         loaded = under_conditions(load_weights(file), conditions)
     if options.level == "mm" and loaded.domain.conditions.get("force_field") == QUANTUM:
         raise InputError(f"{loaded.path.name} is of {QUANTUM}; leave `level` out, or ask for that.")
+    known = getattr(loaded.model.config, "solvents", ())
+    if known and config.solvent is None:
+        others = " and ".join(known[1:])
+        tell(molecule.name, f"no solvent named: taken to be in {known[0]}; weights know {others}", quiet=options.quiet)
     saved_ps = choose_lag(loaded, config.lag_ps, None) if config.save_every_ps is None else config.save_every_ps
     # The verb counts the frames of one replica; all advance together.
     ps_per_frame = saved_ps * len(files[0])

@@ -428,12 +428,17 @@ def test_weights_of_two_solvents_know_which_is_meant(frames: TrainingFrames, tmp
     )
 
 
-def test_a_rollout_says_in_which_solvent_of_its_weights(frames: TrainingFrames, tmp_path: Path) -> None:
+def test_a_rollout_says_in_which_solvent_of_its_weights(
+    frames: TrainingFrames, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     wet = in_water(frames)
     both = train_peptides([frames, wet], tmp_path / "w.safetensors", SMALL, PeptideTraining(steps=2))
     told = sm.info(both)
     assert told["molecules"] == ["ACE-ALA-NME"] and "obc2 or tip3p" in told["summary"]
     assert "ff14SB/tip3p" in told["solvents"]["tip3p"]
+    for solvent in (None, "tip3p"):
+        sm.rollout(frames.scene, both, tmp_path / f"{solvent}_short.h5", time_ps=8.0, solvent=solvent, guard="off")
+        assert ("no solvent named: taken to be in obc2" in capsys.readouterr().err) == (solvent is None)
     deviations = {}
     for solvent in (None, "obc2", "tip3p"):
         out = tmp_path / f"{solvent}.h5"
