@@ -8,11 +8,11 @@ WATER and OBC2 are folders of `peptide_campaign`: what is in WATER/train is lear
 and what is in WATER/test is rolled as often and as long, from the same first frames. Weights W, for OBC2, are taken as
 they are (`unchanged`); their frames are weighed and their time is stretched as monomers in both solvents say
 (`corrected`, `peptide_correction`); they are trained further, `whole`, or the probabilities of `states` alone, or whole
-on both folders (`joint`); and weights are trained `new`, from nothing. `train` makes
-FOLDER/METHOD-RUNS.safetensors, one after the other in one process a core; what is there stays. `table` rolls them all,
-beside MD in both solvents: how far torsions are from MD's in water (`peptide_unseen`, pooled), of every ψ the share of
-time in helices and how often it crosses to the other basin or back, this over MD's in the geometric mean, and the pace
-over that of MD by SIMD replicas on the same core.
+on both folders (`joint`); and weights are trained `new`, from nothing. `train` makes FOLDER/METHOD-RUNS.safetensors,
+one after the other in one process a core; what is there stays. `table` rolls them all, and the shipped weights where
+these know water, beside MD in both solvents: how far torsions are from MD's in water (`peptide_unseen`, pooled), of
+every ψ the share of time in helices and how often it crosses to the other basin or back, this over MD's in the
+geometric mean, and the pace over that of MD by SIMD replicas on the same core.
 """
 
 from __future__ import annotations
@@ -44,6 +44,7 @@ from systems.scene import Scene
 from systems.trajectory.codec import open_trajectory
 
 FloatArray = npt.NDArray[np.float64]
+SHIPPED = "peptides"
 TABLES = Path(__file__).parents[2] / "results" / "tables"
 # By what follows `peptide_transfer`: whether it goes on from weights, and what is tuned of these.
 TRAINED = {"new": None, "states": "states", "whole": "all", "joint": "all"}
@@ -192,6 +193,9 @@ def make_table(folder: Path, water: Path, obc2: Path, start: str, out: Path) -> 
         method = list(TRAINED)[k]
         runs, faster = roll(path, "tip3p" if TRAINED[method] else None)
         lines.append((*row(WORDS[method], f"{simulated_ns(water / 'train', n):.0f}", even(runs)), faster))
+    if "tip3p" in (shipped := load_weights(weights_path(SHIPPED))).model.config.solvents:
+        runs, faster = roll(shipped.path, "tip3p")
+        lines.append((*row(f"`{SHIPPED}`, shipped", f"{shipped.provenance['reference_ns']:.0f}", even(runs)), faster))
     named = [name for m in tests for name in m.psi]
     about = {
         "command": f"python docs/studies/training/peptide_water.py table FOLDER WATER OBC2 --start {start}",
@@ -219,7 +223,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("folder", type=Path)
     parser.add_argument("water", type=Path)
     parser.add_argument("obc2", type=Path)
-    parser.add_argument("--start", default="peptides")
+    parser.add_argument("--start", default=SHIPPED)
     parser.add_argument("--methods", nargs="+", choices=TRAINED, default=list(TRAINED))
     parser.add_argument("--runs", type=int, nargs="+", default=(1, 4, 16))
     parser.add_argument("--steps", type=int, default=600)
