@@ -68,7 +68,9 @@ def test_what_is_written_counts_not_the_water_around_it(monkeypatch: pytest.Monk
     rates = measure(wet, config, None, cores=1)
     assert rates.platform == "simd" and rates.n_atoms == SCENE.n_atoms < wet.n_atoms
     assert measure(wet, replace(config, keep="all"), None, cores=1).n_atoms == wet.n_atoms
-    assert "solvent obc2, not tip3p" in rates.coverage, "the molecule is known, water is not"
+    assert "shipped peptides" in rates.coverage, "the molecule is known in water, too"
+    other = measure(wet, replace(config, force=replace(spec, force_field="ff19SB")), None, cores=1)
+    assert "force_field ff14SB, not ff19SB" in other.coverage
     slower = replace(config, platform="CPU")
     assert measure(wet, slower, None, cores=1).n_atoms == wet.n_atoms, "OpenMM writes all"
 
