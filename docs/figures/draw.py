@@ -99,8 +99,8 @@ def draw_n_body(table: dict[str, Any], out: Path) -> None:
 def draw_water(rates: dict[str, Any], populations: dict[str, Any], out: Path) -> None:
     """Draw how often psi crosses over MD's, and how far torsions are from MD's, against the MD in water that each way
     of training learned from; grey: MD's own standard error."""
-    figure, both = plt.subplots(1, 2, figsize=(7.4, 3.2), layout="constrained", sharex=True)
-    rows = {(row[0], row[1]): (numbers(row[-1]), float(other[2]))
+    figure, both = plt.subplots(1, 2, figsize=(7.6, 3.6), layout="constrained", sharex=True)
+    rows = {(row[0].replace("`", ""), row[1]): (numbers(row[-1]), float(other[2]))
             for row, other in zip(rates["rows"], populations["rows"], strict=True)}  # fmt: skip
     _, low, high = rows.pop((rates["rows"][0][0], ""))[0]
     both[0].axhspan(low, high, color="0.9")
@@ -109,6 +109,7 @@ def draw_water(rates: dict[str, Any], populations: dict[str, Any], out: Path) ->
     for axes, value, label in ((both[0], implicit[0][0], "MD in OBC2"), (both[1], implicit[1], None)):
         axes.axhline(1.0, color="black", lw=0.8, zorder=0)
         axes.axhline(value, color="black", lw=0.8, ls=":", label=label, zorder=0)
+    ticks: set[float] = set()
     for k, name in enumerate(dict.fromkeys(name for name, _ in rows)):
         some = sorted((float(ns) or least / 4, *found) for (what, ns), found in rows.items() if what == name)
         x = np.array([ns for ns, *_ in some]) * 1.03 ** (k - 2)
@@ -116,13 +117,14 @@ def draw_water(rates: dict[str, Any], populations: dict[str, Any], out: Path) ->
         style = {"marker": "o", "ms": 4, "lw": 1, "color": f"C{k}"}
         both[0].errorbar(x, y[:, 0], [y[:, 0] - y[:, 1], y[:, 2] - y[:, 0]], capsize=2, label=name, **style)
         both[1].plot(x, [apart for *_, apart in some], **style)
+        if len(some) > 1:
+            ticks |= {float(ns) for what, ns in rows if what == name}
     both[0].set(ylabel="ψ crossings over MD's", yscale="log", yticks=(0.5, 1, 2, 4, 8), yticklabels=(0.5, 1, 2, 4, 8))
     both[0].minorticks_off()
-    both[1].set(ylabel="distance of torsions over MD's own")
-    ticks = sorted({float(ns) for _, ns in rows} - {0.0})
+    both[1].set(ylabel="distance of torsions over MD's", ylim=(0.9, None))
     for axes in both:
-        axes.set(xscale="log", xlabel="MD of monomers in water, ns", xticks=[least / 4, *ticks],
-                 xticklabels=["0", *(f"{t:g}" for t in ticks)])  # fmt: skip
+        axes.set(xscale="log", xlabel="MD of monomers in water, ns", xticks=[least / 4, *sorted(ticks)],
+                 xticklabels=["0", *(f"{t:g}" for t in sorted(ticks))])  # fmt: skip
         axes.minorticks_off()
     figure.legend(*both[0].get_legend_handles_labels(), loc="outside lower center", ncols=3, fontsize=8, frameon=False)
     figure.savefig(out, metadata={"Date": None})

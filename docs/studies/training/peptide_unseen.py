@@ -174,10 +174,20 @@ def worst(md_files: Sequence[Path], rollouts: Sequence[Path]) -> tuple[float, st
 
 
 def bought(scene: Scene, frame_nm: FloatArray, md_file: Path, rollout: Path) -> float:
-    """Return the time of MD, ps of each of sixteen replicas, that a core simulates in the wall time of a rollout, at
-    the pace of some steps of MD now."""
-    with open_trajectory(md_file) as one, open_trajectory(rollout) as other:
-        spent_s, solvent = float(other.record["cost"]["wall_s"]), one.record["solvent"]
+    """Return the time of MD, ps of each of sixteen replicas, that a core simulates in the wall time of a rollout."""
+    return pace(scene, frame_nm, md_file) * spent_s(rollout)
+
+
+def spent_s(rollout: Path) -> float:
+    """Return the wall time of a rollout, of one in a batch its share of that."""
+    with open_trajectory(rollout) as reader:
+        return float(reader.record["cost"]["wall_s"])
+
+
+def pace(scene: Scene, frame_nm: FloatArray, md_file: Path) -> float:
+    """Return how much MD a core simulates now, ps of all replicas a second, by some steps."""
+    with open_trajectory(md_file) as reader:
+        solvent = reader.record["solvent"]
     here, spec = scene.with_positions(frame_nm), IMPLICIT
     if solvent == WATER.solvent:
         here, spec = solvate(replace(here, cell_nm=None), WATER, WaterBox()), WATER
@@ -189,8 +199,7 @@ def bought(scene: Scene, frame_nm: FloatArray, md_file: Path, rollout: Path) -> 
     run.thermalise()
     began, steps = time.perf_counter(), PACE_STEPS[solvent]
     run.step(steps)
-    # Of a replica; `spent_s` is its share of a batch.
-    return run.n_replicas * steps * TIMESTEP_PS / (time.perf_counter() - began) * spent_s
+    return run.n_replicas * steps * TIMESTEP_PS / (time.perf_counter() - began)
 
 
 def correlation_times_ps(series: Sequence[FloatArray]) -> FloatArray:

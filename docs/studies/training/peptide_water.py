@@ -32,7 +32,7 @@ import peptide_transfer
 from peptide_correction import Correction
 from peptide_rollouts import FRAMES_PS, rolled, thinned
 from peptide_scores import Turn, angles, psi_crossings, rarely_positive, turns_of
-from peptide_unseen import bought, densities, over, pooled, shown
+from peptide_unseen import densities, over, pace, pooled, shown, spent_s
 from processes import in_order, is_trained
 
 from md_reference.run.machine import available_cores, machine_name
@@ -129,6 +129,10 @@ class Molecule(NamedTuple):
         return over(pooled, *both)[0]
 
 
+def free_ends(residues: Sequence[str]) -> bool:
+    return residues[0] != "ACE"
+
+
 def with_error(of: Callable[[list[int]], float], n: int) -> str:
     """Return what a statistic is of all `n` runs, and its standard error by leaving one out after the other."""
     without = [of([k for k in range(n) if k != left]) for left in range(n)]
@@ -141,15 +145,21 @@ def row(
     words: str, learned: str, of: Sequence[tuple[Molecule, list[FloatArray], list[FloatArray]]], clock: float = 1.0
 ) -> tuple[list[str], list[str]]:  # fmt: skip
     """Return a line of both tables, of crossings and of populations, of weights that `learned` so many ns: of each
-    molecule runs, and what their frames count."""
-    apart = [molecule.apart(runs, weights) for molecule, runs, weights in of]
+    molecule runs, none where weights do not cover it, and what their frames count."""
+    apart = [m.apart(runs, weights) for m, runs, weights in of if not free_ends(m.scene.residue_names)]
     helices, often, ratios = [], [], []
     for molecule, runs, weights in of:
+        if not runs:
+            often += [""] * len(molecule.psi)
+            helices += [""] * len(molecule.psi)
+            continue
         for k in molecule.psi.values():
             alpha = np.array([[(w * is_alpha(x[:, k])).sum(), w.sum()] for x, w in zip(runs, weights, strict=True)])
             count, of_md = molecule.crossings(runs, k, clock), molecule.crossings(molecule.md, k)
             for found, each, factor in ((helices, alpha, 100.0), (often, count, 1.0)):
                 found.append(with_error(lambda some, e=each, f=factor: f * np.divide(*e[some].sum(axis=0)), len(runs)))
+            if free_ends(molecule.scene.residue_names):
+                continue  # which not all weights cover
             # Half a crossing more, for those never seen; counts scatter as Poisson's.
             (n, ns), (n_md, ns_md) = (x.sum(axis=0) + (0.5, 0.0) for x in (count, of_md))
             ratios.append((math.log(n / ns / n_md * ns_md), 1.0 / n + (1.0 / n_md if runs is not molecule.md else 0.0)))
@@ -162,6 +172,7 @@ def row(
 def make_table(folder: Path, water: Path, obc2: Path, start: str, out: Path) -> None:
     tests = [Molecule.of(water, obc2, place.name) for place in sorted((water / "test").iterdir())
              if len(list(place.glob("run_*.h5"))) >= 4]  # fmt: skip
+    paces = {m.name: pace(m.scene, m.starts_nm[0], m.md_file) for m in tests}
     correction = Correction.of(water / "train", obc2 / "train")
 
     def even(some: Sequence[list[FloatArray]]) -> list[tuple[Molecule, list[FloatArray], list[FloatArray]]]:
@@ -172,9 +183,12 @@ def make_table(folder: Path, water: Path, obc2: Path, start: str, out: Path) -> 
         weights, found, faster = load_weights(path), [], []
         for m in tests:
             outs = [folder / path.stem / m.name / f"{k:02d}.h5" for k in range(len(m.md))]
+            if free_ends(m.scene.residue_names) and not any(map(free_ends, weights.domain.peptides)):
+                found.append([])
+                continue
             frames = rolled(weights, m.scene, outs, m.time_ps, FRAMES_PS, solvent, m.starts_nm)
             found.append([angles(m.turns, x) for x in frames])
-            faster.append(m.time_ps / bought(m.scene, m.starts_nm[0], m.md_file, outs[0]))
+            faster.append(m.time_ps / spent_s(outs[0]) / paces[m.name])
         return found, f"{float(f'{np.mean(faster):.2g}'):,.0f}"
 
     unchanged, faster = roll(weights_path(start), None)
@@ -204,12 +218,12 @@ def make_table(folder: Path, water: Path, obc2: Path, start: str, out: Path) -> 
     each = "; ".join(f"{len(m.md)} runs of {1e-3 * m.time_ps:.2g} ns of {m.name}" for m in tests)
     note = (
         f"{each}. Rollouts from the first frames of MD in TIP3P; MD in OBC2 is longer. Errors over runs, of the "
-        f"geometric mean by counts. Stretched by {correction.clock:.1f}."
+        f"geometric mean by counts; means are of capped pairs. Stretched by {correction.clock:.1f}."
     )
     for path, columns, rows in (
         (out, [*named, "over MD's"], [of_rates for of_rates, *_ in lines]),
         (out.with_stem(f"{out.stem}_helices"), ["torsions, pooled", *named, "faster than MD"],
-         [[*of_helices, pace] for _, of_helices, pace in lines]),
+         [[*of_helices, faster] for _, of_helices, faster in lines]),
     ):  # fmt: skip
         table = {"columns": ["weights for OBC2", "MD, ns", *columns], "rows": rows, **about, "note": note}
         path.write_text(json.dumps(table, ensure_ascii=False, indent=1) + "\n", "utf-8")
