@@ -194,7 +194,7 @@ def rollout(
     known = getattr(loaded.model.config, "solvents", ())
     if known and config.solvent is None:
         others = " and ".join(known[1:])
-        tell(molecule.name, f"no solvent named: taken to be in {known[0]}; weights know {others}", quiet=options.quiet)
+        tell(molecule.name, f"no solvent named: taken to be in {known[0]}; known too: {others}", quiet=options.quiet)
     saved_ps = choose_lag(loaded, config.lag_ps, None) if config.save_every_ps is None else config.save_every_ps
     # The verb counts the frames of one replica; all advance together.
     ps_per_frame = saved_ps * len(files[0])

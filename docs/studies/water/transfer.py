@@ -1,5 +1,7 @@
 """What implicit solvent is worth for explicit water: alanine dipeptide in TIP3P, by `peptides` (OBC2), tuned or not.
 
+`peptides` are the weights before they knew TIP3P, as of commit cf3bf1a; put that file in the place of today's.
+
     python docs/studies/water/transfer.py train FOLDER WATER [--replicas 1 4 16 --steps 1500]
     python docs/studies/water/transfer.py table FOLDER WATER
 
