@@ -222,7 +222,7 @@ def make_table(folder: Path, water: Path, obc2: Path, start: str, out: Path) -> 
     )
     for path, columns, rows in (
         (out, [*named, "over MD's"], [of_rates for of_rates, *_ in lines]),
-        (out.with_stem(f"{out.stem}_helices"), ["torsions, pooled", *named, "faster than MD"],
+        (out.with_stem(f"{out.stem}_helices"), ["torsions, pooled", *named, "pace"],
          [[*of_helices, faster] for _, of_helices, faster in lines]),
     ):  # fmt: skip
         table = {"columns": ["weights for OBC2", "MD, ns", *columns], "rows": rows, **about, "note": note}
