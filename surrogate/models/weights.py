@@ -102,6 +102,11 @@ class TrainingDomain:
         members = self.members
         return tuple(dict.fromkeys([*(d.scene.name for d in members), *(s for d in members for s in d.sequences)]))
 
+    @property
+    def solvents(self) -> tuple[str | None, ...]:
+        """Those of the molecules, each once; the first is meant where none is named."""
+        return tuple(dict.fromkeys(member.conditions.get("solvent") for member in self.members))
+
     def describe(self) -> str:
         """One line for people: 'alanine-dipeptide (C6H12N2O2, 22 atoms), ff14SB/obc2, 300 K, frames 1 ps apart'."""
         c, names = self.conditions, self.names
@@ -112,7 +117,7 @@ class TrainingDomain:
             what = f"{len(names)} molecules ({', '.join(names[:6])}{more})"
         what += " and molecules like them" if self.transferable else ""
         what = what if self.chemistry is None else self.chemistry.describe()
-        solvents = " or ".join(dict.fromkeys(str(domain.conditions.get("solvent")) for domain in self.members))
+        solvents = " or ".join(map(str, self.solvents))
         md = f"{f}/{solvents}, {c.get('temperature_k')} K" if (f := c.get("force_field")) else "unknown MD"
         return f"{what}, {md}, frames {lags} ps apart"
 

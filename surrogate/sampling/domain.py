@@ -480,7 +480,7 @@ def under_conditions(weights: Weights, asked: Mapping[str, Any]) -> Weights:
 
 def domain_under(domain: TrainingDomain, asked: Mapping[str, Any], name: str) -> TrainingDomain:
     """Return the domain of the molecules that weights of that name saw in one solvent, as `under_conditions` does."""
-    members, solvents = domain.members, list(dict.fromkeys(m.conditions.get("solvent") for m in domain.members))
+    members, solvents = domain.members, domain.solvents
     if len(solvents) > 1:
         solvent = asked.get("solvent") or solvents[0]
         members = tuple(m for m in members if m.conditions.get("solvent") == solvent)

@@ -179,7 +179,8 @@ def _weights(path: Path) -> dict[str, Any]:
     from surrogate.sampling.domain import domain_under
 
     weights = load_weights(path)
-    domain, solvents = weights.domain, getattr(weights.model.config, "solvents", ())
+    domain = weights.domain
+    each = {str(s): domain_under(domain, {"solvent": s}, path.name).describe() for s in domain.solvents}
     n_parameters = sum(p.numel() for p in weights.model.parameters())
     return {
         "file": str(path),
@@ -192,11 +193,7 @@ def _weights(path: Path) -> dict[str, Any]:
         "formula": domain.scene.formula,
         "molecules": list(domain.names),
         "covers_unseen_molecules": domain.transferable,
-        **(
-            {"solvents": {s: domain_under(domain, {"solvent": s}, path.name).describe() for s in solvents}}
-            if solvents
-            else {}
-        ),
+        **({"solvents": each} if len(each) > 1 else {}),
         "lag_ps": domain.lag_ps,
         "longest_lag_ps": domain.longest_lag_ps,
         "conditions": domain.conditions,

@@ -178,7 +178,7 @@ def rollout(
     file = None if weights is None else weights_path(weights)
     molecule = prepare_scene(scene, options, quiet=options.quiet)
 
-    from surrogate.models.weights import load_weights
+    from surrogate.models.weights import load_weights, read_header
     from surrogate.sampling.domain import choose_lag, choose_weights, under_conditions
     from surrogate.sampling.runner import rollout as roll
 
@@ -191,10 +191,11 @@ def rollout(
         loaded = under_conditions(load_weights(file), conditions)
     if options.level == "mm" and loaded.domain.conditions.get("force_field") == QUANTUM:
         raise InputError(f"{loaded.path.name} is of {QUANTUM}; leave `level` out, or ask for that.")
-    known = getattr(loaded.model.config, "solvents", ())
-    if known and config.solvent is None:
-        others = " and ".join(known[1:])
-        tell(molecule.name, f"no solvent named: taken to be in {known[0]}; known too: {others}", quiet=options.quiet)
+    if config.solvent is None and hasattr(loaded.model.config, "solvents"):
+        first, *others = map(str, read_header(loaded.path).domain.solvents)
+        if others:
+            said = f"no solvent named: taken to be in {first}; known too: {' and '.join(others)}"
+            tell(molecule.name, said, quiet=options.quiet)
     saved_ps = choose_lag(loaded, config.lag_ps, None) if config.save_every_ps is None else config.save_every_ps
     # The verb counts the frames of one replica; all advance together.
     ps_per_frame = saved_ps * len(files[0])

@@ -454,5 +454,8 @@ def test_a_rollout_says_in_which_solvent_of_its_weights(
     # Trained on in water alone, weights are of water.
     on = train_peptides([wet], tmp_path / "on.safetensors", SMALL, PeptideTraining(steps=2), start=load_weights(both))
     assert under_conditions(load_weights(on), {}).model.solvent == "tip3p"
+    assert "ff14SB/tip3p" in sm.info(on)["summary"] and "solvents" not in sm.info(on)
+    sm.rollout(frames.scene, on, tmp_path / "on.h5", time_ps=8.0, guard="off")
+    assert "no solvent named" not in capsys.readouterr().err
     with pytest.raises(OutOfDomainError, match="solvent tip3p, not obc2"):
         under_conditions(load_weights(on), {"solvent": "obc2"})
