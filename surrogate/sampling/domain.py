@@ -461,8 +461,18 @@ def choose_weights(
     why = "cover this molecule although it was not in their training set" if unseen else "were trained on this molecule"
     beside = f"; {', '.join(others)} would also work" if others else ""
     # Those that were asked know the molecule's minimum.
-    weights = loaded.get(name) or under_conditions(load_weights(path), asked)
-    return weights, f"no weights named: using the shipped {name}, which {why}{beside}"
+    weights = loaded.get(name) or load_weights(path)
+    solvent = f"; {said}" if (said := assumed_solvent(weights.domain, asked)) else ""
+    said = f"no weights named: using the shipped {name}, which {why}{beside}{solvent}"
+    return under_conditions(weights, asked), said
+
+
+def assumed_solvent(domain: TrainingDomain, asked: Mapping[str, Any]) -> str:
+    """Return which solvent is meant where none is asked for and weights know several, else nothing."""
+    first, *others = map(str, domain.solvents)
+    if asked.get("solvent") or not others:
+        return ""
+    return f"no solvent named: taken to be in {first}; known too: {' and '.join(others)}"
 
 
 def under_conditions(weights: Weights, asked: Mapping[str, Any]) -> Weights:

@@ -178,8 +178,8 @@ def rollout(
     file = None if weights is None else weights_path(weights)
     molecule = prepare_scene(scene, options, quiet=options.quiet)
 
-    from surrogate.models.weights import load_weights, read_header
-    from surrogate.sampling.domain import choose_lag, choose_weights, under_conditions
+    from surrogate.models.weights import load_weights
+    from surrogate.sampling.domain import assumed_solvent, choose_lag, choose_weights, under_conditions
     from surrogate.sampling.runner import rollout as roll
 
     config = part_of(options, RolloutConfig)
@@ -188,14 +188,12 @@ def rollout(
         loaded, why = choose_weights(molecule, temperature_k=config.temperature_k, conditions=conditions)
         tell(molecule.name, why, quiet=options.quiet)
     else:
-        loaded = under_conditions(load_weights(file), conditions)
+        whole = load_weights(file)
+        loaded = under_conditions(whole, conditions)
+        if said := assumed_solvent(whole.domain, conditions):
+            tell(molecule.name, said, quiet=options.quiet)
     if options.level == "mm" and loaded.domain.conditions.get("force_field") == QUANTUM:
         raise InputError(f"{loaded.path.name} is of {QUANTUM}; leave `level` out, or ask for that.")
-    if config.solvent is None and hasattr(loaded.model.config, "solvents"):
-        first, *others = map(str, read_header(loaded.path).domain.solvents)
-        if others:
-            said = f"no solvent named: taken to be in {first}; known too: {' and '.join(others)}"
-            tell(molecule.name, said, quiet=options.quiet)
     saved_ps = choose_lag(loaded, config.lag_ps, None) if config.save_every_ps is None else config.save_every_ps
     # The verb counts the frames of one replica; all advance together.
     ps_per_frame = saved_ps * len(files[0])
