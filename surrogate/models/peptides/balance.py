@@ -1,4 +1,4 @@
-"""Detailed balance of the probabilities that torsions change their states, set after training."""
+"""Detailed balance and rates of the probabilities that torsions change their states, set after training."""
 
 from __future__ import annotations
 
@@ -32,8 +32,8 @@ _PASSES = 4
 # Holds levels that few peptides show near zero, and what one torsion may ask for within bounds.
 _RIDGE, _MOST = 0.3, 3.0
 # Of changes between other states: frames of equilibrium by which they are counted, how long after them, how often, and
-# what holds levels near zero.
-_FRAMES, _CHANGES_PS, _CHANGES_PASSES, _CHANGES_RIDGE = 2000, (10.0, 100.0), 2, 3.0
+# what holds levels near zero: as much as so many peptides, or, where it is rates, so many changes.
+_FRAMES, _CHANGES_PS, _CHANGES_PASSES, _CHANGES_RIDGE = 2000, (10.0, 100.0), 3, 3.0
 
 
 class Phi(NamedTuple):
@@ -50,12 +50,15 @@ class Phi(NamedTuple):
 
 class Change(NamedTuple):
     """Two states of one torsion of a residue: the `types` of the residue and of those beside it, which `torsion`, both
-    states, and the logarithm of how many more frames go back from the second than to it."""
+    states, the logarithm of how many more frames go back from the second than to it, and how many changes of either
+    direction are `expected` and `seen` in as many windows as the runs hold end to end."""
 
     types: tuple[int, int, int]
     torsion: int
     states: tuple[int, int]
     lacking: float
+    expected: float
+    seen: float
 
 
 @torch.no_grad()
@@ -74,8 +77,9 @@ def _balance(model: PeptideSlide, jumps: StateJumps, subjects: Sequence[PeptideS
             found.setdefault((change.torsion, *change.states), []).append(change)
         for (torsion, a, b), some in found.items():
             levels = _levels(jumps, [c.types for c in some], [c.lacking for c in some], _CHANGES_RIDGE) / 2
-            jumps.raise_change(torsion, a, b, levels)
-            jumps.raise_change(torsion, b, a, -levels)
+            rates = _rates(jumps, some)
+            jumps.raise_change(torsion, a, b, rates + levels)
+            jumps.raise_change(torsion, b, a, rates - levels)
     phis = [phi for subject in subjects for phi in weighted_phis(model, subject)]
     types = [phi.chain.places[phi.residue, :3].tolist() for phi in phis]
     for _ in range(_PASSES if phis else 0):
@@ -91,28 +95,51 @@ def _levels(jumps: StateJumps, types: Sequence[Sequence[int]], lacking: Sequence
     return found.reshape(3, -1).float().to(jumps.of_change.device)
 
 
+def _rates(jumps: StateJumps, some: Sequence[Change]) -> Tensor:
+    """Return levels `(3, n_types)` at which as many changes are expected as were seen, as far as counts tell: a step of
+    Newton's for Poisson's likelihood. First all residues move alike, then each, then by its neighbours."""
+    has = F.one_hot(torch.tensor([c.types for c in some]), jumps.of_change.shape[1]).double()
+    expected, seen = torch.tensor([(c.expected, c.seen) for c in some], dtype=torch.float64).T
+    lacking = ((seen + 0.5) / (expected + 0.5)).log().clamp(-_MOST, _MOST)
+    counted, found = (seen + expected) / 2, []
+    for part in (has[:, 0].sum(1, keepdim=True), has[:, 0], has[:, 1:].flatten(1)):
+        held = (counted[:, None] * part).T @ part + _CHANGES_RIDGE * torch.eye(part.shape[1], dtype=torch.float64)
+        found.append(torch.linalg.solve(held, part.T @ (counted * lacking)))
+        lacking = lacking - part @ found[-1]
+    return torch.cat([found[0] + found[1], found[2]]).reshape(3, -1).float().to(jumps.of_change.device)
+
+
 @torch.no_grad()
 def changes(model: PeptideSlide, subject: PeptideSubject) -> list[Change]:
-    """Return every two states of a peptide's torsions that enough frames of equilibrium show, but the signs of phi."""
-    if subject.weights is None:
-        return []
+    """Return every two states of a peptide's torsions that enough frames of equilibrium show, but the signs of phi;
+    none where no run is long enough."""
     chain, counts = subject.chain, subject.chain.stated.counts
     generator = torch.Generator().manual_seed(_SIDE_SEED)
-    idx = torch.multinomial(torch.from_numpy(subject.weights), _FRAMES, True, generator=generator)
-    observed, now = subject.seen(model, idx)
-    is_now = F.one_hot(now.long(), chains.MOST_STATES).float()
-    logs = []
-    for time_ps in _CHANGES_PS:
-        times = torch.full((_FRAMES, 1), time_ps, device=observed.device)
+    logs, held = [], torch.zeros(())
+    both = torch.zeros(2, *counts.shape, chains.MOST_STATES, chains.MOST_STATES)
+    for time_ps in _CHANGES_PS if subject.weights is not None else ():
+        ahead = max(1, round(time_ps / subject.frames.lag_ps))
+        idx, ends_to_end = subject.in_turn(_FRAMES, ahead, generator)
+        if not len(idx):
+            continue
+        observed, now = subject.seen(model, idx)
+        times = torch.full((_FRAMES, 1), ahead * subject.frames.lag_ps, device=observed.device)
         uniform = torch.rand(_FRAMES, 1, *counts.shape, generator=generator).to(observed.device)
         shares = torch.zeros(*uniform.shape, chains.MOST_STATES, device=observed.device)
         apart = times_apart(times, model.config.forgotten_ps)
         model.jumps_of(chain).draw(observed, now, chain.places, counts, times, apart, uniform, shares)
-        logs.append(torch.einsum("nrka,nrkb->rkab", is_now, shares[:, 0]).clamp(min=1e-6).log())
-    flux, held = torch.stack(logs).mean(0), is_now.sum(0)
-    types = chain.places[:, :3].tolist()
+        is_now, is_then = (
+            F.one_hot(x.long(), chains.MOST_STATES).float().cpu() for x in (now, subject.states(idx + ahead))
+        )
+        fluxes = torch.stack([torch.einsum("nrka,nrkb->rkab", is_now, then) for then in (shares[:, 0].cpu(), is_then)])
+        logs.append(fluxes[0].clamp(min=1e-6).log())
+        both += ends_to_end / _FRAMES / len(_CHANGES_PS) * (fluxes + fluxes.mT)
+        held = held + is_now.sum(0)
+    if not logs:
+        return []
+    flux, types = torch.stack(logs).mean(0), chain.places[:, :3].tolist()
     return [
-        Change((*types[r],), k, (a, b), float(flux[r, k, b, a] - flux[r, k, a, b]))
+        Change((*types[r],), k, (a, b), float(flux[r, k, b, a] - flux[r, k, a, b]), *both[:, r, k, a, b].tolist())
         for r, k in torch.nonzero(counts > 1).tolist() if k or r not in chain.signed
         for a, b in combinations(range(int(counts[r, k])), 2) if min(held[r, k, a], held[r, k, b]) >= _LEAST_FRAMES
     ]  # fmt: skip

@@ -271,6 +271,18 @@ class PeptideSubject:
         place = torch.rand(n, generator=generator, dtype=torch.float64).numpy()
         return torch.from_numpy(np.searchsorted(self._cumulative, place * self._cumulative[-1], side="right"))
 
+    def in_turn(self, n: int, ahead: int, generator: torch.Generator) -> tuple[Tensor, float]:
+        """Draw frames `(n,)` by their weights, those that as many as `ahead` follow in their run, none where none has;
+        and return how many windows of that length, one after the other, tell as much as all such frames."""
+        assert self.weights is not None
+        ranges = self.frames.split.ranges(self.frames.starts, validation=False)
+        starts = torch.cat([torch.arange(low, max(low, high - ahead)) for low, high in ranges])
+        likely = torch.from_numpy(self.weights)[starts]
+        if not likely.sum() > 0:
+            return starts[:0], 0.0
+        alike = float(likely.sum() ** 2 / likely.square().sum())
+        return starts[torch.multinomial(likely, n, True, generator=generator)], alike / ahead
+
     @cached_property
     def _cumulative(self) -> FloatArray:
         return np.cumsum(cast(FloatArray, self.weights))
