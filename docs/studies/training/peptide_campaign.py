@@ -8,9 +8,9 @@ states: sixteen replicas in OBC2, 100 ps at 500 K and 100 ps at 300 K. In water 
 1 ps apart without water) the replicas are turned to the torsions of these; in OBC2 (the wide campaign, frames 5 ps
 apart) they go on from them, those of `fine` 300 ps long and frames 1 ps apart. The first 25 ps in water and 50 ps in
 OBC2 are left out. In OBC2 half of the tests come first and the other half last; in water the residues that the first
-tests are made of, these tests, the other monomers, two pairs with free ends and two without, the capped tests again,
-pairs with every residue once at either place, further tests and pairs and chains, then more runs of all. What is there
-is left alone and what was stopped goes on.
+tests are made of, these tests, the other monomers, two pairs with free ends and eight without, the capped tests again,
+the rest of pairs with every residue once at either place, further tests, pairs and chains, then more runs of all. What
+is there is left alone and what was stopped goes on.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ TEST, FURTHER_TEST = (
          (("PHE",), True), (("ALA", "SER", "VAL", "LEU"), True), (("ILE", "GLN", "ALA", "PHE"), False)),
     )
 )  # fmt: skip
-TRAINING_PS, ROUNDS, FIRST_PAIRS = 200.0, 12, 2
+TRAINING_PS, ROUNDS, FIRST_FREE, FIRST_PAIRS = 200.0, 12, 2, 10
 DISCARDED_PS = {"tip3p": 25.0, "obc2": 50.0}
 SAVED_PS = {"tip3p": 1.0, "obc2": 5.0}
 FINE_PS, FINE_SAVED_PS = 300.0, 1.0
@@ -151,9 +151,9 @@ def order(solvent: str) -> list[tuple[str, Peptide, int]]:
     n, m = len(tested), len(RESIDUES)
     again = [peptide for peptide in TEST if peptide.capped]
     free = [peptide for peptide in others if not peptide.capped]
-    others = [*free[:FIRST_PAIRS], *(peptide for peptide in others if peptide not in free[:FIRST_PAIRS])]
-    parts = (("train", monomers[:n], 0), ("test", TEST, 0), ("train", (*monomers[n:], *others[: 2 * FIRST_PAIRS]), 0),
-             ("test", again, 1), ("train", others[2 * FIRST_PAIRS : m], 0), ("test", FURTHER_TEST, 0),
+    others = [*free[:FIRST_FREE], *(peptide for peptide in others if peptide not in free[:FIRST_FREE])]
+    parts = (("train", monomers[:n], 0), ("test", TEST, 0), ("train", (*monomers[n:], *others[:FIRST_PAIRS]), 0),
+             ("test", again, 1), ("train", others[FIRST_PAIRS:m], 0), ("test", FURTHER_TEST, 0),
              ("train", others[m:], 0))  # fmt: skip
     return [
         *((kind, peptide, number) for kind, some, number in parts for peptide in some),
