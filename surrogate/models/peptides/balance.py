@@ -16,8 +16,9 @@ from surrogate.models.peptides.model import PeptideSlide, StateJumps, times_apar
 from surrogate.models.peptides.subjects import PeptideSubject
 
 # Trained by log-likelihood alone, not quite as many frames of equilibrium go one way as the other, and populations err
-# by as much. So after training the levels of a residue's type and of its neighbours' are moved, for every torsion and
-# both directions of every change alike, to where fluxes are equal in the mean over training peptides.
+# by as much; and a training that is short, as one on little data must be, has not moved rates far. So after it the
+# levels of residues' types are moved, for every change of every torsion: both directions alike to where as many are
+# expected as runs show, and one against the other to where fluxes are equal, in the mean over training peptides.
 #
 # Runs from chosen starts show hundreds of exits from phi > 0 and hardly an entry, and a rate that is three times too
 # high shows in no loss. There the probabilities of entering alone are moved, given those of leaving and the free energy
@@ -32,8 +33,8 @@ _PASSES = 4
 # Holds levels that few peptides show near zero, and what one torsion may ask for within bounds.
 _RIDGE, _MOST = 0.3, 3.0
 # Of changes between other states: frames of equilibrium by which they are counted, how long after them, how often, and
-# what holds levels near zero: as much as so many peptides, or, where it is rates, so many changes.
-_FRAMES, _CHANGES_PS, _CHANGES_PASSES, _CHANGES_RIDGE = 2000, (10.0, 100.0), 3, 3.0
+# how far, squared, what one level says for all peptides is from each; and what holds levels near zero.
+_FRAMES, _CHANGES_PS, _CHANGES_PASSES, _MOLECULES_DIFFER, _CHANGES_RIDGE = 2000, (10.0, 100.0), 3, 0.1, 5.0
 
 
 class Phi(NamedTuple):
@@ -60,6 +61,16 @@ class Change(NamedTuple):
     expected: float
     seen: float
 
+    @property
+    def slow(self) -> float:
+        """The logarithm of how many times too rare it is."""
+        return math.log((self.seen + 0.5) / (self.expected + 0.5))
+
+    @property
+    def counted(self) -> float:
+        """The inverse of how far, squared, `lacking` and `slow` err: by few changes, and since molecules differ."""
+        return 1.0 / (2.0 / (self.seen + self.expected + 1.0) + _MOLECULES_DIFFER)
+
 
 @torch.no_grad()
 def balance(model: PeptideSlide, subjects: Sequence[PeptideSubject]) -> None:
@@ -76,8 +87,8 @@ def _balance(model: PeptideSlide, jumps: StateJumps, subjects: Sequence[PeptideS
         for change in (change for subject in subjects for change in changes(model, subject)):
             found.setdefault((change.torsion, *change.states), []).append(change)
         for (torsion, a, b), some in found.items():
-            levels = _levels(jumps, [c.types for c in some], [c.lacking for c in some], _CHANGES_RIDGE) / 2
-            rates = _rates(jumps, some)
+            levels = _own_levels(jumps, some, [c.lacking for c in some]) / 2
+            rates = _own_levels(jumps, some, [c.slow for c in some])
             jumps.raise_change(torsion, a, b, rates + levels)
             jumps.raise_change(torsion, b, a, rates - levels)
     phis = [phi for subject in subjects for phi in weighted_phis(model, subject)]
@@ -95,18 +106,17 @@ def _levels(jumps: StateJumps, types: Sequence[Sequence[int]], lacking: Sequence
     return found.reshape(3, -1).float().to(jumps.of_change.device)
 
 
-def _rates(jumps: StateJumps, some: Sequence[Change]) -> Tensor:
-    """Return levels `(3, n_types)` at which as many changes are expected as were seen, as far as counts tell: a step of
-    Newton's for Poisson's likelihood. First all residues move alike, then each, then by its neighbours."""
-    has = F.one_hot(torch.tensor([c.types for c in some]), jumps.of_change.shape[1]).double()
-    expected, seen = torch.tensor([(c.expected, c.seen) for c in some], dtype=torch.float64).T
-    lacking = ((seen + 0.5) / (expected + 0.5)).log().clamp(-_MOST, _MOST)
-    counted, found = (seen + expected) / 2, []
-    for part in (has[:, 0].sum(1, keepdim=True), has[:, 0], has[:, 1:].flatten(1)):
-        held = (counted[:, None] * part).T @ part + _CHANGES_RIDGE * torch.eye(part.shape[1], dtype=torch.float64)
-        found.append(torch.linalg.solve(held, part.T @ (counted * lacking)))
-        lacking = lacking - part @ found[-1]
-    return torch.cat([found[0] + found[1], found[2]]).reshape(3, -1).float().to(jumps.of_change.device)
+def _own_levels(jumps: StateJumps, some: Sequence[Change], lacking: Sequence[float]) -> Tensor:
+    """Return levels `(3, n_types)` that come near to what is `lacking` (n,): all residues move alike, then each. Levels
+    of neighbours stay: moved so, they bring peptides that are left out farther from what they lack."""
+    own = F.one_hot(torch.tensor([c.types[0] for c in some]), jumps.of_change.shape[1]).double()
+    counted = torch.tensor([c.counted for c in some], dtype=torch.float64)
+    left, levels = torch.tensor(lacking, dtype=torch.float64).clamp(-_MOST, _MOST), torch.zeros(3, own.shape[1])
+    for part in (own.sum(1, keepdim=True), own):
+        weighed = counted * part.T
+        found = torch.linalg.solve(weighed @ part + _CHANGES_RIDGE * torch.eye(part.shape[1]).double(), weighed @ left)
+        left, levels[0] = left - part @ found, levels[0] + found.float()
+    return levels.to(jumps.of_change.device)
 
 
 @torch.no_grad()

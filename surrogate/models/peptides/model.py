@@ -39,6 +39,8 @@ _RARELY = -5.0
 _FAST = 10.0
 # Residues further apart along the chain are alike far.
 _FAR = 6
+# Of hidden numbers, as many are left out in each window of training: sequences are few.
+DROPPED = 0.2
 _COUPLED_BLOCKS, _COUPLED_HEADS = 2, 4
 
 
@@ -158,12 +160,13 @@ class StateJumps(nn.Module):
 
     def loss(
         self, observed: Tensor, states: Tensor, places: Tensor, counts: Tensor, times_ps: Tensor, apart_ps: Tensor,
-        share: Tensor | None = None,
+        share: Tensor | None = None, kept: Tensor | float = 1.0,
     ) -> Tensor:  # fmt: skip
         """Return the negative log-likelihood of what torsions did, per frame and torsion.
 
         `observed` (b, r, slots); `states` (b, 1 + t, r, MOST_TORSIONS), the given frame's first; `share` (b, r,
-        MOST_TORSIONS): what each torsion's change counts in a window, 1 where it is not given.
+        MOST_TORSIONS): what each torsion's change counts in a window, 1 where it is not given; `kept` (b, 1, r, width):
+        factors of hidden numbers.
         """
         with torch.autocast(observed.device.type, enabled=False):
             before, new = states[:, :-1], states[:, 1:]
@@ -172,7 +175,7 @@ class StateJumps(nn.Module):
             h = self.of_frames(conditioning_states(before, counts), conditioning_states(earlier, counts))
             h = h + of_times[:, :, None] + self.of_observed(observed, states[:, 0], places, counts)[:, None]
             conditioning = conditioning_states(new, counts)
-            h = h + self.of_new_states(conditioning)
+            h = kept * (h + self.of_new_states(conditioning))
             total = observed.new_zeros(())
             for torsion in torch.nonzero((counts > 0).any(0))[:, 0].tolist():
                 has = torch.nonzero(counts[:, torsion])[:, 0]

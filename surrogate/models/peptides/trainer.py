@@ -28,7 +28,7 @@ from surrogate.models.peptides.layout import (
     standard_peptide,
     unknown_coordinates,
 )
-from surrogate.models.peptides.model import PeptideSlide, times_apart
+from surrogate.models.peptides.model import DROPPED, PeptideSlide, times_apart
 from surrogate.models.peptides.subjects import PeptideSubject, StateWindows
 from surrogate.models.weights import (
     TrainingDomain,
@@ -406,11 +406,17 @@ def state_loss(
 ) -> Tensor:  # fmt: skip
     """Return the negative log-likelihood of the changes of states: `observed` (b, r, slots) the given frame's numbers,
     `states` (b, 1 + t, r, MOST_TORSIONS), `times_ps` (b, t), `share` (b, r, MOST_TORSIONS) what each change counts,
-    1 where it is not given; otherwise as `peptide_loss`."""
+    1 where it is not given. `noisy`: the given frame is disturbed and hidden numbers are left out, as in training."""
+    jumps, kept, apart = (
+        model.jumps_of(chain),
+        cast(Tensor | float, 1.0),
+        times_apart(times_ps, model.config.forgotten_ps),
+    )
     if noisy:
         observed = disturbed(observed, chain, model.config, generator)
-    apart = times_apart(times_ps, model.config.forgotten_ps)
-    return model.jumps_of(chain).loss(observed, states, chain.places, chain.stated.counts, times_ps, apart, share)
+        drawn = torch.rand(len(observed), 1, observed.shape[1], jumps.hidden.in_features, generator=generator)
+        kept = ((drawn >= DROPPED) / (1 - DROPPED)).to(observed.device)
+    return jumps.loss(observed, states, chain.places, chain.stated.counts, times_ps, apart, share, kept)
 
 
 def disturbed(

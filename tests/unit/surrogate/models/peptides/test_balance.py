@@ -92,14 +92,14 @@ def test_a_residue_that_is_not_seen_moves_with_all_others() -> None:
     balance(model, [PeptideSubject(f, chain_features(f.scene, config), np.ones(f.n_frames)) for f in sets])
     moved = (model.jumps.of_change - start)[0, :, 1].flatten(1)
     shown = [moved[2 + config.types.index(name), 1] for name in ("ALA", "SER", "THR")]
-    assert moved[-1, 1] == pytest.approx(np.mean(shown), abs=0.5) and moved[-1, 1] > 1.0
+    assert moved[-1, 1] == pytest.approx(np.mean(shown), rel=0.2) and moved[-1, 1] > 1.0
 
 
 def test_a_solvent_is_balanced_by_frames_in_it() -> None:
-    frames = _frames("ACE-ALA-NME", kind="psi")
+    frames = _jumping(_frames("ACE-ALA-NME", kind="psi"), 0.2, 0.05)
     config = PeptideConfig(width=16, n_layers=1, n_heads=1, chunk_frames=4, solvents=("obc2", "tip3p"))
     config = with_scale(config, [frames])
-    wet = PeptideSubject(frames, chain_features(frames.scene, config, "tip3p"), np.repeat([1.6, 0.4], EACH))
+    wet = PeptideSubject(frames, chain_features(frames.scene, config, "tip3p"), np.ones(2 * EACH))
     torch.manual_seed(0)
     model = PeptideSlide(config).requires_grad_(False)
     dry, water = model.jumps.of_change.clone(), model.jumps_elsewhere[0].of_change.clone()

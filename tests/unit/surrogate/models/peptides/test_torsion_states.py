@@ -29,6 +29,7 @@ from surrogate.models.peptides.chains import (
 )
 from surrogate.models.peptides.layout import PeptideConfig, chain_features, chain_layout, chain_scale
 from surrogate.models.peptides.model import PeptideSlide, StateJumps, times_apart
+from surrogate.models.peptides.trainer import state_loss
 from systems.chemistry.geometry import torsion
 from systems.prepare.peptide import build_peptide
 from systems.scene import Scene
@@ -136,6 +137,23 @@ def test_the_loss_is_the_negative_log_likelihood_of_what_was_done() -> None:
     forbidden = jumps.loss(torch.zeros(1, 2, 4), states, places, counts, time, time).detach()
     crosses = 1.0 / (1.0 + np.exp(-(1.0 + 0.5 * 2.0 - 10.0 * 0.2)))
     assert float(forbidden) == pytest.approx((-np.log(crosses) - np.log(turns)) / 2.0, rel=1e-5)
+
+
+def test_training_leaves_hidden_numbers_out_at_random_and_nothing_else_does() -> None:
+    scene = build_peptide("ACE-VAL-NME")
+    config = replace(_config(scene), conditioning_noise=0.0)
+    chain, model = chain_features(scene, config), PeptideSlide(config).requires_grad_(False)
+    model.jumps.logits.weight.normal_(generator=torch.Generator().manual_seed(0))
+    numbers, states = model.normalised(torch.tensor(scene.positions_nm)[None].repeat(64, 1, 1), chain)
+
+    def loss(seed: int, noisy: bool = True) -> float:
+        generator, times = torch.Generator().manual_seed(seed), torch.full((64, 1), 10.0)
+        given = numbers, torch.stack([states, states], dim=1), times, generator
+        return float(state_loss(model, chain, *given, noisy=noisy))
+
+    assert loss(0) == loss(0) != loss(1)
+    assert loss(0, noisy=False) == loss(1, noisy=False)
+    assert abs(loss(0) / loss(0, noisy=False) - 1.0) > 0.001
 
 
 def test_draws_change_as_often_as_their_probabilities_say_and_turn_two_torsions_at_once() -> None:
