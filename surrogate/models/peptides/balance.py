@@ -12,6 +12,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from surrogate.models.peptides import chains
+from surrogate.models.peptides.layout import ENDS
 from surrogate.models.peptides.model import PeptideSlide, StateJumps, times_apart
 from surrogate.models.peptides.subjects import PeptideSubject
 
@@ -32,9 +33,15 @@ _LEAST_FRAMES = 50
 _PASSES = 4
 # Holds levels that few peptides show near zero, and what one torsion may ask for within bounds.
 _RIDGE, _MOST = 0.3, 3.0
-# Of changes between other states: frames of equilibrium by which they are counted, how long after them, how often, and
-# how far, squared, what one level says for all peptides is from each; and what holds levels near zero.
-_FRAMES, _CHANGES_PS, _CHANGES_PASSES, _MOLECULES_DIFFER, _CHANGES_RIDGE = 2000, (10.0, 100.0), 3, 0.1, 5.0
+# Of changes between other states: frames of equilibrium by which they are counted, and after how many steps of a
+# rollout: in one step many go back and forth over a barrier. How often levels are moved, how far, squared, what one
+# level says for all peptides is from each, and what holds levels near zero.
+_FRAMES, _STEP_PS, _STEPS = 1000, 10.0, (2, 10)
+_CHANGES_PASSES, _MOLECULES_DIFFER, _CHANGES_RIDGE = 3, 0.1, 5.0
+
+
+# What stands beside a residue in the place of another.
+_ENDS = (*ENDS, "ACE", "NME")
 
 
 class Phi(NamedTuple):
@@ -82,13 +89,14 @@ def balance(model: PeptideSlide, subjects: Sequence[PeptideSubject]) -> None:
 
 def _balance(model: PeptideSlide, jumps: StateJumps, subjects: Sequence[PeptideSubject]) -> None:
     """Do so in one solvent."""
+    ends = torch.tensor([k for k, name in enumerate((*ENDS, *model.config.types)) if name in _ENDS])
     for _ in range(_CHANGES_PASSES):
         found: dict[tuple[int, int, int], list[Change]] = {}
         for change in (change for subject in subjects for change in changes(model, subject)):
             found.setdefault((change.torsion, *change.states), []).append(change)
         for (torsion, a, b), some in found.items():
-            levels = _own_levels(jumps, some, [c.lacking for c in some]) / 2
-            rates = _own_levels(jumps, some, [c.slow for c in some])
+            levels = _own_levels(jumps, ends, some, [c.lacking for c in some]) / 2
+            rates = _own_levels(jumps, ends, some, [c.slow for c in some])
             jumps.raise_change(torsion, a, b, rates + levels)
             jumps.raise_change(torsion, b, a, rates - levels)
     phis = [phi for subject in subjects for phi in weighted_phis(model, subject)]
@@ -106,16 +114,21 @@ def _levels(jumps: StateJumps, types: Sequence[Sequence[int]], lacking: Sequence
     return found.reshape(3, -1).float().to(jumps.of_change.device)
 
 
-def _own_levels(jumps: StateJumps, some: Sequence[Change], lacking: Sequence[float]) -> Tensor:
-    """Return levels `(3, n_types)` that come near to what is `lacking` (n,): all residues move alike, then each. Levels
-    of neighbours stay: moved so, they bring peptides that are left out farther from what they lack."""
-    own = F.one_hot(torch.tensor([c.types[0] for c in some]), jumps.of_change.shape[1]).double()
+def _own_levels(jumps: StateJumps, ends: Tensor, some: Sequence[Change], lacking: Sequence[float]) -> Tensor:
+    """Return levels `(3, n_types)` that come near to what is `lacking` (n,): first all residues move alike, then those
+    beside caps and at free ends, which have the types `ends`, then each. Levels of other neighbours stay: moved so,
+    they bring peptides that are left out farther from what they lack."""
+    has = F.one_hot(torch.tensor([c.types for c in some]), jumps.of_change.shape[1]).double()
     counted = torch.tensor([c.counted for c in some], dtype=torch.float64)
-    left, levels = torch.tensor(lacking, dtype=torch.float64).clamp(-_MOST, _MOST), torch.zeros(3, own.shape[1])
-    for part in (own.sum(1, keepdim=True), own):
+    left, levels = torch.tensor(lacking, dtype=torch.float64).clamp(-_MOST, _MOST), torch.zeros(3, has.shape[2])
+    found = []
+    for part in (has[:, 0].sum(1, keepdim=True), has[:, 1:][..., ends].flatten(1), has[:, 0]):
         weighed = counted * part.T
-        found = torch.linalg.solve(weighed @ part + _CHANGES_RIDGE * torch.eye(part.shape[1]).double(), weighed @ left)
-        left, levels[0] = left - part @ found, levels[0] + found.float()
+        held = weighed @ part + _CHANGES_RIDGE * torch.eye(part.shape[1], dtype=torch.float64)
+        found.append(torch.linalg.solve(held, weighed @ left).float())
+        left = left - part @ found[-1].double()
+    levels[0] = found[0] + found[2]
+    levels[1:, ends] = found[1].reshape(2, -1)
     return levels.to(jumps.of_change.device)
 
 
@@ -125,28 +138,28 @@ def changes(model: PeptideSlide, subject: PeptideSubject) -> list[Change]:
     none where no run is long enough."""
     chain, counts = subject.chain, subject.chain.stated.counts
     generator = torch.Generator().manual_seed(_SIDE_SEED)
-    logs, held = [], torch.zeros(())
-    both = torch.zeros(2, *counts.shape, chains.MOST_STATES, chains.MOST_STATES)
-    for time_ps in _CHANGES_PS if subject.weights is not None else ():
-        ahead = max(1, round(time_ps / subject.frames.lag_ps))
-        idx, ends_to_end = subject.in_turn(_FRAMES, ahead, generator)
-        if not len(idx):
-            continue
-        observed, now = subject.seen(model, idx)
-        times = torch.full((_FRAMES, 1), ahead * subject.frames.lag_ps, device=observed.device)
-        uniform = torch.rand(_FRAMES, 1, *counts.shape, generator=generator).to(observed.device)
-        shares = torch.zeros(*uniform.shape, chains.MOST_STATES, device=observed.device)
-        apart = times_apart(times, model.config.forgotten_ps)
-        model.jumps_of(chain).draw(observed, now, chain.places, counts, times, apart, uniform, shares)
-        is_now, is_then = (
-            F.one_hot(x.long(), chains.MOST_STATES).float().cpu() for x in (now, subject.states(idx + ahead))
-        )
-        fluxes = torch.stack([torch.einsum("nrka,nrkb->rkab", is_now, then) for then in (shares[:, 0].cpu(), is_then)])
-        logs.append(fluxes[0].clamp(min=1e-6).log())
-        both += ends_to_end / _FRAMES / len(_CHANGES_PS) * (fluxes + fluxes.mT)
-        held = held + is_now.sum(0)
-    if not logs:
+    if subject.weights is None:
         return []
+    step = max(1, round(_STEP_PS / subject.frames.lag_ps))
+    idx, ends_to_end = subject.in_turn(_FRAMES, step * _STEPS[-1], generator)
+    if not len(idx):
+        return []
+    observed, now = subject.seen(model, idx)
+    ahead = step * torch.arange(1, _STEPS[-1] + 1)
+    times = (ahead * subject.frames.lag_ps).float().expand(_FRAMES, -1).to(observed.device)
+    uniform = torch.rand(_FRAMES, len(ahead), *counts.shape, generator=generator).to(observed.device)
+    shares = torch.zeros(*uniform.shape, chains.MOST_STATES, device=observed.device)
+    apart = times_apart(times, model.config.forgotten_ps)
+    model.jumps_of(chain).draw(observed, now, chain.places, counts, times, apart, uniform, shares)
+    is_now = F.one_hot(now.long(), chains.MOST_STATES).float().cpu()
+    logs, both = [], torch.zeros(2, *counts.shape, chains.MOST_STATES, chains.MOST_STATES)
+    for k in _STEPS:
+        is_then = F.one_hot(subject.states(idx + step * k), chains.MOST_STATES).float()
+        later = (shares[:, k - 1].cpu(), is_then)
+        fluxes = torch.stack([torch.einsum("nrka,nrkb->rkab", is_now, then) for then in later])
+        logs.append(fluxes[0].clamp(min=1e-6).log())
+        both += ends_to_end * _STEPS[-1] / k / _FRAMES / len(_STEPS) * (fluxes + fluxes.mT)
+    held = is_now.sum(0)
     flux, types = torch.stack(logs).mean(0), chain.places[:, :3].tolist()
     return [
         Change((*types[r],), k, (a, b), float(flux[r, k, b, a] - flux[r, k, a, b]), *both[:, r, k, a, b].tolist())

@@ -30,12 +30,13 @@ def _frames(sequence: str, kind: str = "phi") -> TrainingFrames:
 
 
 def _jumping(frames: TrainingFrames, often: float, rarely: float) -> TrainingFrames:
-    """The frames in another order: a run that goes from the first side to the second `rarely` and back `often`."""
+    """The frames in another order, 10 ps apart: a run that goes from the first side to the second `rarely` and back
+    `often`."""
     rng, sides, order = np.random.default_rng(1), [0], []
     for place in range(2 * EACH):
         order.append(sides[-1] * EACH + place % EACH)
         sides.append(sides[-1] ^ int(rng.random() < (rarely, often)[sides[-1]]))
-    return replace(frames, coordinates=frames.coordinates[order], starts=np.array([0, 2 * EACH]))
+    return replace(frames, coordinates=frames.coordinates[order], starts=np.array([0, 2 * EACH]), lag_ps=10.0)
 
 
 def _subject(frames: TrainingFrames, config: PeptideConfig) -> PeptideSubject:
@@ -80,7 +81,8 @@ def test_as_many_frames_change_one_way_as_the_other_and_as_often_as_runs_show() 
     balance(model, subjects)
     after = np.array(_weighed(model, subjects))
     # Residues of several peptides go by all of them, which differ.
-    assert (after.max(axis=0) < 0.3 * before.max(axis=0)).all() and after[:, 1].mean() < 0.4
+    assert (after.max(axis=0) < 0.3 * before.max(axis=0)).all()
+    assert (after.mean(axis=0) < 0.3 * before.mean(axis=0)).all()
 
 
 def test_a_residue_that_is_not_seen_moves_with_all_others() -> None:
