@@ -407,15 +407,12 @@ def state_loss(
     """Return the negative log-likelihood of the changes of states: `observed` (b, r, slots) the given frame's numbers,
     `states` (b, 1 + t, r, MOST_TORSIONS), `times_ps` (b, t), `share` (b, r, MOST_TORSIONS) what each change counts,
     1 where it is not given. `noisy`: the given frame is disturbed and hidden numbers are left out, as in training."""
-    jumps, kept, apart = (
-        model.jumps_of(chain),
-        cast(Tensor | float, 1.0),
-        times_apart(times_ps, model.config.forgotten_ps),
-    )
+    jumps, kept = model.jumps_of(chain), torch.ones((), device=observed.device)
     if noisy:
         observed = disturbed(observed, chain, model.config, generator)
         drawn = torch.rand(len(observed), 1, observed.shape[1], jumps.hidden.in_features, generator=generator)
         kept = ((drawn >= DROPPED) / (1 - DROPPED)).to(observed.device)
+    apart = times_apart(times_ps, model.config.forgotten_ps)
     return jumps.loss(observed, states, chain.places, chain.stated.counts, times_ps, apart, share, kept)
 
 
