@@ -38,7 +38,7 @@ _RIDGE, _MOST = 0.3, 3.0
 # level says for all peptides is from each, and what holds levels near zero.
 _FRAMES, _STEP_PS, _STEPS = 1000, 10.0, (2, 10)
 _CHANGES_PASSES, _MOLECULES_DIFFER, _CHANGES_RIDGE = 3, 0.1, 5.0
-# What stands beside a residue in the place of another.
+# Neighbours that are no residues: free ends and caps.
 _ENDS = (*ENDS, "ACE", "NME")
 
 
