@@ -134,10 +134,10 @@ def _own_levels(jumps: StateJumps, ends: Tensor, some: Sequence[Change], lacking
 def changes(model: PeptideSlide, subject: PeptideSubject) -> list[Change]:
     """Return every two states of a peptide's torsions that enough frames of equilibrium show, but the signs of phi;
     none where no run is long enough."""
-    chain, counts = subject.chain, subject.chain.stated.counts
-    generator = torch.Generator().manual_seed(_SIDE_SEED)
     if subject.weights is None:
         return []
+    chain, counts = subject.chain, subject.chain.stated.counts
+    generator = torch.Generator().manual_seed(_SIDE_SEED)
     step = max(1, round(_STEP_PS / subject.frames.lag_ps))
     idx, ends_to_end = subject.in_turn(_FRAMES, step * _STEPS[-1], generator)
     if not len(idx):

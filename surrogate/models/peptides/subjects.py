@@ -275,8 +275,10 @@ class PeptideSubject:
         """Draw frames `(n,)` by their weights, those that as many as `ahead` follow in their run, none where none has;
         and return how many windows of that length, one after the other, tell as much as all such frames."""
         assert self.weights is not None
-        ranges = self.frames.split.ranges(self.frames.starts, validation=False)
-        starts = torch.cat([torch.arange(low, max(low, high - ahead)) for low, high in ranges])
+        try:
+            starts = torch.from_numpy(self.frames.window_starts(ahead + 1, validation=False))
+        except InputError:
+            return torch.zeros(0, dtype=torch.long), 0.0
         likely = torch.from_numpy(self.weights)[starts]
         if not likely.sum() > 0:
             return starts[:0], 0.0
