@@ -1,6 +1,6 @@
 """Teach weights of peptides to arrive in few evaluations: `python docs/studies/training/peptide_distil.py OUT ...`.
 
-`--train`: a folder of training runs (`train` in a folder of `peptide_runs`), of which windows are drawn. What is in OUT
+`--train`: folders of training runs (`train` in a folder of `peptide_runs`), of which windows are drawn. What is in OUT
 half done is gone on with.
 """
 
@@ -130,11 +130,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("out", type=Path)
     parser.add_argument("--weights", type=Path, required=True, help="of the labeller")
-    parser.add_argument("--train", type=Path, required=True)
+    parser.add_argument("--train", type=Path, nargs="+", required=True)
     parser.add_argument("--steps", type=int, default=2, help="evaluations of a rollout")
     parser.add_argument("--budget", required=True, help="wall time, as 40min")
     a = parser.parse_args(arguments)
-    sets = [frames for folder in sorted(a.train.iterdir()) for frames in training_sets(folder)]
+    sets = [frames for folder in a.train for place in sorted(folder.iterdir()) for frames in training_sets(place)]
     training = PeptideTraining(
         budget_s=parse_wall_s(a.budget, "--budget"), learning_rate=_LEARNING_RATE, validate_every_s=_VALIDATE_S
     )

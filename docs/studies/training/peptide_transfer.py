@@ -1,13 +1,13 @@
 """Train weights for peptides on runs in one solvent or several, from nothing or from others.
 
     python docs/studies/training/peptide_transfer.py OUT.safetensors --train FOLDER [FOLDER ...] --budget 1h
-               [--start WEIGHTS] [--tuned all|states] [--coupled] [--runs 16] [--steps N] [--unseen 12] [--half]
+               [--start WEIGHTS] [--tuned all|flow|states] [--coupled] [--runs 16] [--steps N] [--unseen 12] [--half]
 
-FOLDER: `train` in a folder of `peptide_campaign` or `peptide_runs`, of each molecule in it the first `--runs`. `states`
-trains the probabilities of torsion states alone, and needs `--start`. `--unseen`: every so many molecules of several
-residues one is left out, and the curves show its loss. `--half` rounds to float16 at the end. Free energies of φ > 0
-are those of `peptide_energies` beside OUT, or those that the weights gone on from were trained with. A training that
-was stopped goes on.
+FOLDER: `train` in a folder of `peptide_campaign` or `peptide_runs`, of each molecule in it the first `--runs`. `flow`
+and `states` train the flow or the probabilities of torsion states alone, and need `--start`. `--unseen`: every so many
+molecules of several residues one is left out, and the curves show its loss. `--half` rounds to float16 at the end. Free
+energies of φ > 0 are those of `peptide_energies` beside OUT, or those that the weights gone on from were trained with.
+A training that was stopped goes on.
 """
 
 from __future__ import annotations

@@ -55,7 +55,7 @@ JUMPS_SHARE = 0.2
 _JUMPS_BATCH = 128
 # Molecules of which the domain of weights keeps all that is checked.
 _WHOLE = 40
-TUNED = ("all", "states")
+TUNED = ("all", "flow", "states")
 # Torsions' numbers vary by at least this: omega's cosine is all but constant, and nothing is learned of its rounding.
 _LEAST_SCALE = 0.05
 
@@ -67,8 +67,8 @@ class PeptideTraining:
     `time_reversal`: windows are read backwards, too, and frames drawn from equilibrium stand for endless times, both
     weighted by a Markov model of each molecule (`models.peptides.subjects`). `positive_phi_kt`: of residue types, the
     free energy of phi > 0 over phi < 0 in kT, which every solvent is taken to have. `tuned`: of weights that training
-    goes on from, 'all', or the probabilities of 'states' alone, in the solvents of the frames: in others such weights
-    stay what they are.
+    goes on from, 'all', the 'flow' alone, or the probabilities of 'states' alone, these in the solvents of the frames:
+    in others such weights stay what they are.
     """
 
     budget_s: float | None = None
@@ -124,7 +124,7 @@ def train_peptides(
     _fill_unseen(model, measured)
     if training.time_reversal:
         subjects = [subject.in_equilibrium(training.positive_phi_kt) for subject in subjects]
-    of_jumps = 1.0 if training.tuned == "states" else JUMPS_SHARE
+    of_jumps = {"all": JUMPS_SHARE, "flow": 0.0, "states": 1.0}[training.tuned]
     flow_s, jumps_s = (
         None if training.budget_s is None else share * training.budget_s for share in (1 - of_jumps, of_jumps)
     )
@@ -175,7 +175,7 @@ def train_peptides(
                 found.setdefault(f"{name}_{key}", []).append(float(value))
         return {key: float(np.mean(values)) for key, values in found.items()}
 
-    domain = peptides_domain(sets, config, start.domain if start is not None and training.tuned == "states" else None)
+    domain = peptides_domain(sets, config, start.domain if start is not None and training.tuned != "all" else None)
 
     def write(spent_s: list[float]) -> None:
         settings: dict[str, Any] = {"seed": training.seed, "spent_s": round(sum(spent_s), 1)}
@@ -185,9 +185,10 @@ def train_peptides(
 
     def in_turn() -> Iterator[Stage]:
         for stage, trained, loss_fn in zip(stages, (model.flow, model.all_jumps), (flow_loss, jumps_loss), strict=True):
-            if stage.name == "jumps" or training.tuned != "states":
+            if training.tuned in ("all", {"flow": "flow", "jumps": "states"}[stage.name]):
                 yield Stage(trained, stage, loss_fn, partial(validate, stage))
-        balance(model, subjects)
+        if training.tuned != "flow":
+            balance(model, subjects)
 
     train_stages(in_turn(), out, write, device=device, resume=resume, progress=progress)
     return out
@@ -207,7 +208,7 @@ def peptides_domain(
     sets: Sequence[TrainingFrames], config: PeptideConfig, start: TrainingDomain | None = None
 ) -> TrainingDomain:
     """Return the domain of weights for peptides: of each solvent the smallest molecules, whose own frames say what is
-    valid, and the names of all others; in solvents that `sets` do not show, what weights gone on from cover."""
+    valid, and the names of all others. `start`: of weights of which a part stays; what they cover stays covered."""
     smallest: dict[str, dict[str, TrainingFrames]] = {}
     for frames in sorted(sets, key=lambda frames: (frames.scene.n_atoms, frames.lag_ps)):
         of_solvent = smallest.setdefault(str(frames.conditions.get("solvent")), {})
@@ -216,13 +217,19 @@ def peptides_domain(
     several = len({f.scene.topology_hash for f in sets}) > 1
     found: list[TrainingDomain] = []
     for solvent in config.solvents or smallest:
-        some = smallest.get(solvent, {})
-        kept = list(map(id, list(some.values())[:_WHOLE]))
-        whole = [training_domain(f, strides=_strides(config, f)) for f in sets if id(f) in kept]
-        found += [replace(one, sequences=tuple(some)[_WHOLE:] if one is whole[0] else ()) for one in whole]
-        if not some and start is not None and start.transferable == several:
+        some, covered = smallest.get(solvent, {}), []
+        if start is not None and start.transferable == several:
             members = (replace(member, further=()) for member in start.members)
-            found += (member for member in members if str(member.conditions.get("solvent")) == solvent)
+            covered = [member for member in members if str(member.conditions.get("solvent")) == solvent]
+        if covered and several and all(f.conditions == covered[0].conditions for f in some.values()):
+            known = replace(covered[0], further=tuple(covered[1:])).peptides
+            new = (name for name in some if tuple(name.split("-")) not in known)
+            covered[0] = replace(covered[0], sequences=(*covered[0].sequences, *new))
+        elif some:
+            kept = list(map(id, list(some.values())[:_WHOLE]))
+            whole = [training_domain(f, strides=_strides(config, f)) for f in sets if id(f) in kept]
+            covered = [replace(one, sequences=tuple(some)[_WHOLE:] if one is whole[0] else ()) for one in whole]
+        found += covered
     return replace(found[0], further=tuple(found[1:]), transferable=several)
 
 

@@ -157,6 +157,18 @@ def test_of_many_peptides_the_larger_are_known_by_their_residues(
     domain = trainer.peptides_domain([trembling(name) for name in reversed(TRAINED)], weights.model.config)
     assert [d.scene.name for d in domain.members] == list(TRAINED[1::-1]) and domain.sequences == TRAINED[2:]
     assert built(TrainingDomain, domain.to_dict()).sequences == domain.sequences and "3 molecules" in domain.describe()
+    # Where a part of weights stays, what they cover stays covered.
+    first = trainer.peptides_domain([trembling(name) for name in TRAINED[:2]], weights.model.config)
+    more = [trembling(name) for name in TRAINED[1:]]
+    further = trainer.peptides_domain(more, weights.model.config, first)
+    assert further.members[1:] == first.members[1:] and further == replace(
+        first, sequences=TRAINED[2:], further=further.further
+    )
+    warm = [replace(frames, conditions={**frames.conditions, "temperature_k": 350.0}) for frames in more]
+    assert (
+        trainer.peptides_domain(warm, weights.model.config, first).peptides
+        == trainer.peptides_domain(warm, weights.model.config).peptides
+    )
     pair = build_peptide(TRAINED[2])
     for known, seen in ((domain, True), (replace(domain, sequences=()), False)):
         match = match_domain(pair, replace(weights, domain=known), force=True)

@@ -370,7 +370,7 @@ def test_runs_too_short_to_hold_a_chunk_out_are_trained_on_without(frames: Train
         train_peptides([short], tmp_path / "b.safetensors", SMALL, once)
 
 
-def test_probabilities_of_states_can_be_trained_alone_and_coupled(frames: TrainingFrames, tmp_path: Path) -> None:
+def test_probabilities_of_states_or_the_flow_can_be_trained_alone(frames: TrainingFrames, tmp_path: Path) -> None:
     first = train_peptides(
         [frames], tmp_path / "a.safetensors", replace(SMALL, usual_steps=3), PeptideTraining(steps=2)
     )
@@ -385,6 +385,11 @@ def test_probabilities_of_states_can_be_trained_alone_and_coupled(frames: Traini
     assert any(name.startswith("jumps.blocks") for name in after) and found.usual_steps == 3
     on = load_weights(train_peptides([frames], tmp_path / "c.safetensors", SMALL, alone, start=load_weights(first)))
     assert not any(name.startswith("jumps.blocks") for name in on.model.state_dict())
+    alone = replace(alone, tuned="flow")
+    on = load_weights(train_peptides([frames], tmp_path / "d.safetensors", SMALL, alone, start=load_weights(first)))
+    after = on.model.state_dict()
+    moved = {name.split(".")[0] for name, tensor in before.items() if not torch.equal(tensor, after[name])}
+    assert moved == {"flow"} and on.model.usual_steps == 6
 
 
 def test_weights_of_two_solvents_know_which_is_meant(frames: TrainingFrames, tmp_path: Path) -> None:
