@@ -1,7 +1,9 @@
 """Teach weights of peptides to arrive in few evaluations: `python docs/studies/training/peptide_distil.py OUT ...`.
 
-`--train`: folders of training runs (`train` in a folder of `peptide_runs`), of which windows are drawn. What is in OUT
-half done is gone on with.
+`--train`: folders of training runs (`train` in a folder of `peptide_campaign` or `peptide_runs`), of which windows are
+drawn. `--earlier TAUGHT LABELLER`: weights that were taught before, and by which; those taught now begin as these,
+changed by what the labeller has learned since, and need minutes instead of an hour. What is in OUT half done is gone on
+with.
 """
 
 from __future__ import annotations
@@ -10,10 +12,11 @@ import argparse
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 import torch
-from peptide_subset import training_sets
+from peptide_transfer import sets_of
 from torch import Tensor
 
 from surrogate.data import FrameSets, TrainingFrames
@@ -50,10 +53,12 @@ def distil(
     training: PeptideTraining,
     *,
     steps: int,
+    earlier: tuple[Weights, Weights] | None = None,
     resume: bool = False,
 ) -> Path:
     """Write weights `out` that roll in `steps` evaluations, taught by those of `start` on windows of `sets`; beside it
-    a CSV of how far both end apart, in the units of the flow. Raises SimulationError when training diverges."""
+    a CSV of how far both end apart, in the units of the flow. `earlier`: weights taught before, and the labeller of
+    those, from which `start` was trained further. Raises SimulationError when training diverges."""
     torch.manual_seed(training.seed)
     assert isinstance(start.model, PeptideSlide)
     device = torch.device(training.device)
@@ -61,6 +66,9 @@ def distil(
     config = replace(start.model.config, usual_steps=steps, usual_solver=_SOLVER)
     model = PeptideSlide(config).to(device)
     model.load_state_dict(start.model.state_dict())
+    if earlier is not None:
+        taught, before = (cast(PeptideSlide, weights.model).flow.state_dict() for weights in earlier)
+        model.flow.load_state_dict({k: taught[k] + now - before[k] for k, now in labeller.state_dict().items()})
     subjects = [
         PeptideSubject(f, chain_features(f.scene, model.config, f.conditions.get("solvent")).to(device)) for f in sets
     ]
@@ -123,7 +131,7 @@ def arrival_loss(
     return dict(zip(("apart", "turning", "stiff"), by_kind(error, chain, model.config), strict=True))
 
 
-_LEARNING_RATE, _VALIDATE_S = 3e-4, 300.0
+_LEARNING_RATE, _VALIDATE_S = 2e-4, 300.0
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -131,14 +139,16 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("out", type=Path)
     parser.add_argument("--weights", type=Path, required=True, help="of the labeller")
     parser.add_argument("--train", type=Path, nargs="+", required=True)
+    parser.add_argument("--earlier", type=Path, nargs=2, metavar=("TAUGHT", "LABELLER"))
     parser.add_argument("--steps", type=int, default=2, help="evaluations of a rollout")
     parser.add_argument("--budget", required=True, help="wall time, as 40min")
     a = parser.parse_args(arguments)
-    sets = [frames for folder in a.train for place in sorted(folder.iterdir()) for frames in training_sets(place)]
+    earlier = None if a.earlier is None else (load_weights(a.earlier[0]), load_weights(a.earlier[1]))
     training = PeptideTraining(
         budget_s=parse_wall_s(a.budget, "--budget"), learning_rate=_LEARNING_RATE, validate_every_s=_VALIDATE_S
     )
-    distil(sets, load_weights(a.weights), a.out, training, steps=a.steps, resume=True)
+    start, sets = load_weights(a.weights), sets_of(a.train)
+    distil(sets, start, a.out, training, steps=a.steps, earlier=earlier, resume=True)
 
 
 if __name__ == "__main__":

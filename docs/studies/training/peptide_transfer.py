@@ -37,9 +37,9 @@ _VALIDATE_S = 300.0
 _HELD_FRAMES = 20
 
 
-def sets_of(folders: Sequence[Path], runs: int) -> list[TrainingFrames]:
-    """Return the frames of every molecule in folders. Raises InputError for none, and for residues that weights are
-    tested on, whatever their ends."""
+def sets_of(folders: Sequence[Path], runs: int = 10_000) -> list[TrainingFrames]:
+    """Return the frames of every molecule in folders, of so many runs at most. Raises InputError for none, and for
+    residues that weights are tested on, whatever their ends."""
     tested = {"-".join(p.residues) for p in (*unseen_peptides(), *held_out_peptides()) if len(p.residues) > 1}
     found = []
     for place in (place for folder in folders for place in sorted(folder.iterdir()) if place.is_dir()):

@@ -355,6 +355,13 @@ def test_a_flow_is_taught_to_end_in_two_evaluations_where_it_ended_in_six(
     there = rolled(labeller, 6)
     ours, its_own = ((rolled(weights, 2) - there).square().mean() for weights in (found, labeller))
     assert ours < 0.5 * its_own
+    # Taught again, by what the labeller has become, it begins changed as much as that.
+    further, once = load_weights(start), replace(training, steps=1, learning_rate=1e-12)
+    for p in further.model.flow.parameters():
+        p.data += 0.01
+    again = distil([frames], further, tmp_path / "again.safetensors", once, steps=2, earlier=(found, labeller))
+    for name, tensor in load_weights(again).model.flow.named_parameters():
+        torch.testing.assert_close(tensor, found.model.flow.get_parameter(name) + 0.01)
     # What learns further from it ends in two evaluations no more.
     request = TrainingRequest("lam-slide-peptides", tmp_path / "on.safetensors", steps=1, start_from=out)
     model, once = PeptideTrainer().settings(request).model, replace(training, steps=1)
