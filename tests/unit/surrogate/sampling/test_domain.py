@@ -125,8 +125,8 @@ def test_the_nearest_weights_are_those_that_could_be_forced() -> None:
     with pytest.raises(OutOfDomainError, match=nearest):
         choose_weights(prepare("sequence:ACE-LEU-SER-ALA-GLY-VAL-NME"))
     for sequence, why in (
-        ("LEU-ALA-SER", "3 amino acids with free ends; trained on up to 2"),
-        ("SER-LEU", "free ends that no training peptide has: NH3[+]-SER, LEU-COO-"),
+        ("LEU-ALA-SER-ALA-GLY", "5 amino acids with free ends; trained on up to 4"),
+        ("SER-PHE", "free ends that no training peptide has: PHE-COO-"),
     ):
         with pytest.raises(OutOfDomainError, match=why):
             choose_weights(prepare(f"sequence:{sequence}"))
