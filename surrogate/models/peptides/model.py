@@ -200,15 +200,15 @@ class StateJumps(nn.Module):
             # A residue's torsion in each state, as `conditioning_states` has it.
             ones = torch.eye(MOST_STATES, device=observed.device) * (counts > 0)[..., None, None]
             residues, most = torch.arange(len(counts), device=observed.device), (counts - 1).clamp(min=0)
-            torsions = torch.nonzero((counts > 0).any(0))[:, 0].tolist()
+            turns = [(part, torch.nonzero((counts[part] > 0).any(0))[:, 0].tolist()) for part in self.turns]
             now, found = states[:, None], []
             before = conditioning = conditioning_states(now, counts)
             for k in range(times_ps.shape[1]):
                 at = slice(k, k + 1)
                 h = self.of_frames(conditioning, before) + common[:, at]
                 new, before, conditioning = torch.zeros_like(now), conditioning, torch.zeros_like(conditioning)
-                for part in self.turns:
-                    seen = (h + self.of_new_states(conditioning))[..., part, :]
+                for turn, (part, torsions) in enumerate(turns):
+                    seen = (h + self.of_new_states(conditioning) if turn else h)[..., part, :]
                     for torsion in torsions:
                         logits = self.probabilities(
                             torsion, seen, levels[:, at, :, part], now[..., part, torsion], conditioning[..., part, :]
