@@ -83,7 +83,7 @@ def test_as_many_frames_change_one_way_as_the_other_and_as_often_as_runs_show() 
     # Residues of several peptides go by all of them, which differ.
     assert (after.max(axis=0) < 0.3 * before.max(axis=0)).all()
     assert (after.mean(axis=0) < 0.3 * before.mean(axis=0)).all()
-    # Of what stands beside a residue caps alone are told from one another.
+    # Among neighbours only caps have levels of their own.
     beside = model.jumps.beside_change[:, :, 1].abs().flatten(2).sum(-1)
     names = [2 + config.types.index(name) for name in ("ALA", "SER", "ACE", "NME")]
     assert (beside[:, names[:2]] == 0).all() and beside[0, names[2]] > 0 and beside[1, names[3]] > 0
