@@ -7,6 +7,7 @@ import platform
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -173,6 +174,13 @@ def read_header(path: str | Path) -> Header:
 def _header(path: Path) -> tuple[Header, dict[str, str]]:
     if not path.is_file():
         raise InputError(f"weights file {path} does not exist.")
+    found = path.stat()
+    return _header_of(path, (found.st_ino, found.st_mtime_ns, found.st_size))
+
+
+# One command asks what weights cover before it loads them; of many peptides a header is megabytes.
+@lru_cache(maxsize=8)
+def _header_of(path: Path, version: tuple[int, ...]) -> tuple[Header, dict[str, str]]:
     try:
         with safe_open(path, framework="pt") as handle:
             metadata = dict(handle.metadata() or {})

@@ -11,7 +11,7 @@ import time
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -210,6 +210,13 @@ class StageConfig:
     def __post_init__(self) -> None:
         if self.budget_s is None and self.steps is None:
             raise InputError(f"training stage {self.name!r} needs a `budget_s` or a number of steps.")
+
+    def part(self, share: float) -> StageConfig:
+        """Return this stage with a share of its budget, and of its steps."""
+        return replace(
+            self, budget_s=None if self.budget_s is None else share * self.budget_s,
+            steps=None if self.steps is None else max(1, round(share * self.steps)),
+        )  # fmt: skip
 
     def share_done(self, step: int, spent_s: float) -> float:
         shares = [0.0]

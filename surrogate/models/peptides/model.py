@@ -39,8 +39,6 @@ _RARELY = -5.0
 _FAST = 10.0
 # Residues further apart along the chain are alike far.
 _FAR = 6
-# Of hidden numbers, as many are left out in each window of training: sequences are few.
-DROPPED = 0.2
 _COUPLED_BLOCKS, _COUPLED_HEADS = 2, 4
 
 

@@ -28,7 +28,7 @@ from surrogate.models.peptides.layout import (
     standard_peptide,
     unknown_coordinates,
 )
-from surrogate.models.peptides.model import DROPPED, PeptideSlide, times_apart
+from surrogate.models.peptides.model import PeptideSlide, times_apart
 from surrogate.models.peptides.subjects import PeptideSubject, StateWindows
 from surrogate.models.weights import (
     TrainingDomain,
@@ -50,8 +50,9 @@ _HELD_WINDOWS, _LEAST_HELD, _HELD_IN_ALL = 128, 16, 1024
 # Flow times and noise of validation are the same each time.
 _HELD_SEED = 0
 # Of the budget, for the probabilities that torsions change their states: a small network, of which a step costs a
-# tenth.
-JUMPS_SHARE = 0.2
+# tenth. In each of their windows a share of hidden numbers is left out, since sequences are few; but none in the end of
+# their budget, else changes come too often.
+JUMPS_SHARE, _DROPPED, _ENDING_SHARE = 0.2, 0.2, 0.3
 _JUMPS_BATCH = 128
 # Molecules of which the domain of weights keeps all that is checked.
 _WHOLE = 40
@@ -128,11 +129,11 @@ def train_peptides(
     flow_s, jumps_s = (
         None if training.budget_s is None else share * training.budget_s for share in (1 - of_jumps, of_jumps)
     )
-    shared = StageConfig(
+    of_flow = StageConfig(
         "flow", training.batch, training.learning_rate, flow_s, training.steps, seed=training.seed, bf16=training.bf16,
         validate_every_s=training.validate_every_s,
     )  # fmt: skip
-    stages = (shared, replace(shared, name="jumps", batch=_JUMPS_BATCH, budget_s=jumps_s, bf16=False))
+    of_states = replace(of_flow, name="jumps", batch=_JUMPS_BATCH, budget_s=jumps_s, bf16=False)
     n_held = min(_HELD_WINDOWS, max(_LEAST_HELD, _HELD_IN_ALL // (len(subjects) + len(held_out))))
     held = [
         (name, subject, *subject.windows(n_held, config, torch.Generator().manual_seed(_HELD_SEED),
@@ -147,7 +148,7 @@ def train_peptides(
 
     pools: dict[int, StateWindows] = {}
 
-    def jumps_loss(generator: torch.Generator) -> tuple[Tensor, dict[str, Tensor]]:
+    def jumps_loss(generator: torch.Generator, *, dropped: float) -> tuple[Tensor, dict[str, Tensor]]:
         which = pick(subjects, generator)
         subject = subjects[which]
         if which not in pools:
@@ -155,7 +156,8 @@ def train_peptides(
         idx, times, share = pools[which].draw(_JUMPS_BATCH, generator)
         observed, _ = subject.seen(model, idx[:, 0])
         states = subject.states(idx).to(device)
-        loss = state_loss(model, subject.chain, observed, states, times.to(device), generator, share=share.to(device))
+        given = (observed, states, times.to(device), generator)
+        loss = state_loss(model, subject.chain, *given, share=share.to(device), dropped=dropped)
         return loss, {"jumps": loss.detach()}
 
     @torch.no_grad()
@@ -164,7 +166,7 @@ def train_peptides(
         for name, subject, idx, times in held:
             generator = torch.Generator().manual_seed(_HELD_SEED)
             numbers, states = subject.seen(model, idx)
-            if stage.name == "jumps":
+            if stage.name != "flow":
                 loss = state_loss(model, subject.chain, numbers[:, 0], states, times.to(device), generator, noisy=False)
                 terms = {"jumps": loss}
             else:
@@ -184,10 +186,12 @@ def train_peptides(
         save_weights(out, model, domain, provenance_of(FrameSets(tuple(sets)).origin, settings, start))
 
     def in_turn() -> Iterator[Stage]:
-        for stage, trained, loss_fn in zip(stages, (model.flow, model.all_jumps), (flow_loss, jumps_loss), strict=True):
-            if training.tuned in ("all", {"flow": "flow", "jumps": "states"}[stage.name]):
-                yield Stage(trained, stage, loss_fn, partial(validate, stage))
+        if training.tuned != "states":
+            yield Stage(model.flow, of_flow, flow_loss, partial(validate, of_flow))
         if training.tuned != "flow":
+            for name, share, dropped in (("jumps", 1 - _ENDING_SHARE, _DROPPED), ("ending", _ENDING_SHARE, 0.0)):
+                stage = replace(of_states.part(share), name=name)
+                yield Stage(model.all_jumps, stage, partial(jumps_loss, dropped=dropped), partial(validate, stage))
             balance(model, subjects)
 
     train_stages(in_turn(), out, write, device=device, resume=resume, progress=progress)
@@ -223,8 +227,9 @@ def peptides_domain(
             covered = [member for member in members if str(member.conditions.get("solvent")) == solvent]
         if covered and several and all(f.conditions == covered[0].conditions for f in some.values()):
             known = replace(covered[0], further=tuple(covered[1:])).peptides
+            larger = ("-".join(member.scene.residue_names) for member in covered[_WHOLE:])
             new = (name for name in some if tuple(name.split("-")) not in known)
-            covered[0] = replace(covered[0], sequences=(*covered[0].sequences, *new))
+            covered = [replace(covered[0], sequences=(*covered[0].sequences, *larger, *new)), *covered[1:_WHOLE]]
         elif some:
             kept = list(map(id, list(some.values())[:_WHOLE]))
             whole = [training_domain(f, strides=_strides(config, f)) for f in sets if id(f) in kept]
@@ -315,7 +320,12 @@ def normalise(model: PeptideSlide, subjects: Sequence[PeptideSubject], seed: int
     rng = np.random.default_rng(seed)
     lags = model.config.lags_ps
     n_kinds, _, n_slots = model.token_mean.shape
-    by_solvent = (-1, model.config.n_types)
+
+    def of_all_types(sums: Tensor) -> None:
+        for _, _, place in of_ends:
+            each = sums[..., place].unflatten(1, (-1, model.config.n_types))
+            sums[..., place] = each.sum(2, keepdim=True).expand_as(each).flatten(1, 2)
+
     sums = torch.zeros(3, n_kinds, chains.MOST_STATES, n_slots, dtype=torch.float64)
     for subject in subjects:
         kinds = model.kinds(subject.chain).tolist()
@@ -328,9 +338,7 @@ def normalise(model: PeptideSlide, subjects: Sequence[PeptideSubject], seed: int
                 inside = (own[:, r] == state) & subject.chain.code.filled[r]
                 for power in range(3):
                     sums[power, number, state] += (tokens[:, r].pow(power) * inside).sum(0)
-    for _, _, place in of_ends:
-        each = sums[..., place].unflatten(1, by_solvent)
-        sums[..., place] = each.sum(2, keepdim=True).expand_as(each).flatten(1, 2)
+    of_all_types(sums)
     mean = sums[1] / sums[0].clamp(min=1)
     within = (sums[2] - sums[0] * mean.square()).clamp(min=0).sum(1)
     variance = within / sums[0].sum(1).clamp(min=1)
@@ -354,9 +362,7 @@ def normalise(model: PeptideSlide, subjects: Sequence[PeptideSubject], seed: int
                 x, y = both[0, :, r], both[1, :, r]
                 for what, value in enumerate((x * y, x * x, y * y)):
                     products[what, number, k] += value.sum(0)
-    for _, _, place in of_ends:
-        each = products[..., place].unflatten(1, by_solvent)
-        products[..., place] = each.sum(2, keepdim=True).expand_as(each).flatten(1, 2)
+    of_all_types(products)
     for places in of_turning:
         products[:, *places] = products[:, *places].mean(-1, keepdim=True)
     found = products[0] / (products[1] * products[2]).sqrt().clamp(min=1e-12)
@@ -409,16 +415,17 @@ def by_kind(error: Tensor, chain: chains.ChainFeatures, config: PeptideConfig) -
 
 def state_loss(
     model: PeptideSlide, chain: chains.ChainFeatures, observed: Tensor, states: Tensor, times_ps: Tensor,
-    generator: torch.Generator, *, noisy: bool = True, share: Tensor | None = None,
+    generator: torch.Generator, *, noisy: bool = True, share: Tensor | None = None, dropped: float = 0.0,
 ) -> Tensor:  # fmt: skip
     """Return the negative log-likelihood of the changes of states: `observed` (b, r, slots) the given frame's numbers,
     `states` (b, 1 + t, r, MOST_TORSIONS), `times_ps` (b, t), `share` (b, r, MOST_TORSIONS) what each change counts,
-    1 where it is not given. `noisy`: the given frame is disturbed and hidden numbers are left out, as in training."""
-    jumps, kept = model.jumps_of(chain), torch.ones((), device=observed.device)
+    1 where it is not given. `noisy`: the given frame is disturbed, as in training; `dropped`: the share of hidden
+    numbers that are left out."""
+    jumps = model.jumps_of(chain)
     if noisy:
         observed = disturbed(observed, chain, model.config, generator)
-        drawn = torch.rand(len(observed), 1, observed.shape[1], jumps.hidden.in_features, generator=generator)
-        kept = ((drawn >= DROPPED) / (1 - DROPPED)).to(observed.device)
+    drawn = torch.rand(len(observed), 1, observed.shape[1], jumps.hidden.in_features, generator=generator)
+    kept = ((drawn >= dropped) / (1 - dropped)).to(observed.device)
     apart = times_apart(times_ps, model.config.forgotten_ps)
     return jumps.loss(observed, states, chain.places, chain.stated.counts, times_ps, apart, share, kept)
 
@@ -467,8 +474,12 @@ class PeptideTrainer(arch.Trainer):
         start = None if request.start_from is None else load_weights(request.start_from)
 
         def run(advance: arch.AdvanceFn) -> Path:
+            done = {"flow": (0.0, 1 - JUMPS_SHARE), "ending": (1 - _ENDING_SHARE * JUMPS_SHARE, 1.0)}
+            done["jumps"] = (done["flow"][1], done["ending"][0])
+
             def report(stage: str, share: float, metrics: dict[str, float]) -> None:
-                advance(stage, share * (1 - JUMPS_SHARE) if stage == "flow" else 1 - JUMPS_SHARE * (1 - share))
+                low, high = done[stage]
+                advance(stage, low + share * (high - low))
 
             trained, unseen = (list(map(_under_standard_names, some)) for some in (sets.trained, sets.unseen))
             return train_peptides(trained, request.out, settings.model, settings.training, unseen=unseen, start=start,

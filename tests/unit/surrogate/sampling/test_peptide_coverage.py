@@ -157,8 +157,11 @@ def test_of_many_peptides_the_larger_are_known_by_their_residues(
     domain = trainer.peptides_domain([trembling(name) for name in reversed(TRAINED)], weights.model.config)
     assert [d.scene.name for d in domain.members] == list(TRAINED[1::-1]) and domain.sequences == TRAINED[2:]
     assert built(TrainingDomain, domain.to_dict()).sequences == domain.sequences and "3 molecules" in domain.describe()
-    # Where a part of weights stays, what they cover stays covered.
+    # Where a part of weights stays, what they cover stays covered, the larger by their residues.
     first = trainer.peptides_domain([trembling(name) for name in TRAINED[:2]], weights.model.config)
+    whole = replace(first, further=(*first.further, replace(domain, scene=build_peptide(TRAINED[2]), sequences=())))
+    kept = trainer.peptides_domain([trembling(name) for name in TRAINED[:2]], weights.model.config, whole)
+    assert (kept.members[1:], kept.sequences) == (first.members[1:], TRAINED[2:])
     more = [trembling(name) for name in TRAINED[1:]]
     further = trainer.peptides_domain(more, weights.model.config, first)
     assert further.members[1:] == first.members[1:] and further == replace(

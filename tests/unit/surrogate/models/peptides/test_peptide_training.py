@@ -5,17 +5,20 @@ from __future__ import annotations
 import csv
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
 from peptide_distil import distil
+from torch import Tensor
 
 import surrogate as sm
 from small_scenes import with_phi_turned
 from surrogate.data import Split, TrainingFrames, canonicalise, quantise
 from surrogate.models.architecture import TrainingRequest
 from surrogate.models.peptides import subjects as peptide_subjects
+from surrogate.models.peptides import trainer as peptide_trainer
 from surrogate.models.peptides.chains import ChainFeatures
 from surrogate.models.peptides.layout import ENDS, PeptideConfig, chain_features
 from surrogate.models.peptides.model import PeptideSlide
@@ -24,6 +27,7 @@ from surrogate.models.peptides.trainer import (
     PeptideTrainer,
     PeptideTraining,
     normalise,
+    state_loss,
     train_peptides,
     with_scale,
 )
@@ -241,7 +245,7 @@ def test_a_training_learns_and_its_weights_roll_at_any_lag(tmp_path: Path, frame
     weights = load_weights(out)
     with out.with_suffix(".csv").open() as curves:
         ends = {row["stage"]: float(row["spent_s"]) for row in csv.DictReader(curves)}
-    assert set(ends) == {"flow", "jumps"} and all(ends.values())
+    assert list(ends) == ["flow", "jumps", "ending"] and all(ends.values())
     assert weights.domain.longest_lag_ps == pytest.approx(40.0, rel=0.1)
     for lag_ps in (1.0, 20.0):
         trajectory = tmp_path / f"{lag_ps:g}.h5"
@@ -252,6 +256,23 @@ def test_a_training_learns_and_its_weights_roll_at_any_lag(tmp_path: Path, frame
         with open_trajectory(trajectory) as reader:
             assert reader.n_frames == 6
             assert np.isfinite(reader.read()).all()
+
+
+def test_hidden_numbers_are_left_out_until_the_end_of_a_training(
+    tmp_path: Path, frames: TrainingFrames, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    told: list[float] = []
+
+    def spied(*args: Any, dropped: float = 0.0, **more: Any) -> Tensor:
+        told.append(dropped)
+        return state_loss(*args, dropped=dropped, **more)
+
+    monkeypatch.setattr(peptide_trainer, "state_loss", spied)
+    train_peptides(
+        [frames], tmp_path / "a.safetensors", SMALL, PeptideTraining(steps=10, batch=4, validate_every_s=1e9)
+    )
+    # Validations follow the 7 steps and the 3.
+    assert told == [0.2] * 7 + [0.0] * (len(told) - 7) and len(told) > 10
 
 
 def test_a_training_goes_on_from_weights_with_their_scales(tmp_path: Path, frames: TrainingFrames) -> None:

@@ -139,21 +139,21 @@ def test_the_loss_is_the_negative_log_likelihood_of_what_was_done() -> None:
     assert float(forbidden) == pytest.approx((-np.log(crosses) - np.log(turns)) / 2.0, rel=1e-5)
 
 
-def test_training_leaves_hidden_numbers_out_at_random_and_nothing_else_does() -> None:
+def test_hidden_numbers_are_left_out_at_random_as_often_as_told() -> None:
     scene = build_peptide("ACE-VAL-NME")
     config = replace(_config(scene), conditioning_noise=0.0)
     chain, model = chain_features(scene, config), PeptideSlide(config).requires_grad_(False)
     model.jumps.logits.weight.normal_(generator=torch.Generator().manual_seed(0))
     numbers, states = model.normalised(torch.tensor(scene.positions_nm)[None].repeat(64, 1, 1), chain)
 
-    def loss(seed: int, noisy: bool = True) -> float:
+    def loss(seed: int, dropped: float = 0.2) -> float:
         generator, times = torch.Generator().manual_seed(seed), torch.full((64, 1), 10.0)
         given = numbers, torch.stack([states, states], dim=1), times, generator
-        return float(state_loss(model, chain, *given, noisy=noisy))
+        return float(state_loss(model, chain, *given, dropped=dropped))
 
     assert loss(0) == loss(0) != loss(1)
-    assert loss(0, noisy=False) == loss(1, noisy=False)
-    assert abs(loss(0) / loss(0, noisy=False) - 1.0) > 0.001
+    assert loss(0, 0.0) == loss(1, 0.0)
+    assert abs(loss(0) / loss(0, 0.0) - 1.0) > 0.001
 
 
 def test_draws_change_as_often_as_their_probabilities_say_and_turn_two_torsions_at_once() -> None:
