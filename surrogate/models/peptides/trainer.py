@@ -52,7 +52,7 @@ _HELD_SEED = 0
 # Of the budget, for the probabilities that torsions change their states: a small network, of which a step costs a
 # tenth. In each of their windows a share of hidden numbers is left out, since sequences are few; but none in the end of
 # their budget, else changes come too often.
-JUMPS_SHARE, _DROPPED, _ENDING_SHARE = 0.2, 0.2, 0.3
+JUMPS_SHARE, _DROPPED, _ENDING_SHARE = 0.2, 0.2, 0.1
 _JUMPS_BATCH = 128
 # Molecules of which the domain of weights keeps all that is checked.
 _WHOLE = 40

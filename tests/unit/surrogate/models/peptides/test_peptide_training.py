@@ -271,8 +271,8 @@ def test_hidden_numbers_are_left_out_until_the_end_of_a_training(
     train_peptides(
         [frames], tmp_path / "a.safetensors", SMALL, PeptideTraining(steps=10, batch=4, validate_every_s=1e9)
     )
-    # Validations follow the 7 steps and the 3.
-    assert told == [0.2] * 7 + [0.0] * (len(told) - 7) and len(told) > 10
+    # Validations follow the nine steps and the last.
+    assert told == [0.2] * 9 + [0.0] * (len(told) - 9) and len(told) > 10
 
 
 def test_a_training_goes_on_from_weights_with_their_scales(tmp_path: Path, frames: TrainingFrames) -> None:
