@@ -154,7 +154,7 @@ def train_peptides(
         if which not in pools:
             pools[which] = StateWindows.of(subject, config)
         idx, times, share = pools[which].draw(_JUMPS_BATCH, generator)
-        observed, _ = subject.seen(model, idx[:, 0])
+        observed = disturbed(subject.seen(model, idx[:, 0])[0], subject.chain, config, generator)
         states = subject.states(idx).to(device)
         given = (observed, states, times.to(device), generator)
         loss = state_loss(model, subject.chain, *given, share=share.to(device), dropped=dropped)
@@ -167,7 +167,7 @@ def train_peptides(
             generator = torch.Generator().manual_seed(_HELD_SEED)
             numbers, states = subject.seen(model, idx)
             if stage.name != "flow":
-                loss = state_loss(model, subject.chain, numbers[:, 0], states, times.to(device), generator, noisy=False)
+                loss = state_loss(model, subject.chain, numbers[:, 0], states, times.to(device), generator)
                 terms = {"jumps": loss}
             else:
                 with torch.autocast(device.type, dtype=torch.bfloat16, enabled=stage.bf16):
@@ -415,15 +415,12 @@ def by_kind(error: Tensor, chain: chains.ChainFeatures, config: PeptideConfig) -
 
 def state_loss(
     model: PeptideSlide, chain: chains.ChainFeatures, observed: Tensor, states: Tensor, times_ps: Tensor,
-    generator: torch.Generator, *, noisy: bool = True, share: Tensor | None = None, dropped: float = 0.0,
+    generator: torch.Generator, *, share: Tensor | None = None, dropped: float = 0.0,
 ) -> Tensor:  # fmt: skip
     """Return the negative log-likelihood of the changes of states: `observed` (b, r, slots) the given frame's numbers,
     `states` (b, 1 + t, r, MOST_TORSIONS), `times_ps` (b, t), `share` (b, r, MOST_TORSIONS) what each change counts,
-    1 where it is not given. `noisy`: the given frame is disturbed, as in training; `dropped`: the share of hidden
-    numbers that are left out."""
+    1 where it is not given. `dropped`: the share of hidden numbers that are left out."""
     jumps = model.jumps_of(chain)
-    if noisy:
-        observed = disturbed(observed, chain, model.config, generator)
     drawn = torch.rand(len(observed), 1, observed.shape[1], jumps.hidden.in_features, generator=generator)
     kept = ((drawn >= dropped) / (1 - dropped)).to(observed.device)
     apart = times_apart(times_ps, model.config.forgotten_ps)
