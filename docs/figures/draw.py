@@ -61,7 +61,7 @@ def draw_effective(table: dict[str, Any], out: Path) -> None:
         marker = "o" if whose in COLOURS else "s"
         axes.errorbar(rate, y, error, color=colour, marker=marker, capsize=2, lw=1, ms=5, ls="", label=label)
         name = setting if whose in ("OpenMM", *COLOURS) else f"SIMD, {setting}"
-        below = name.startswith(("fitted", "gaussian"))
+        below = name.startswith(("fitted", "gaussian", "angular 2"))
         where = {"xytext": (3, -4) if below else (-3, 4), "ha": "right" if below else "left"}
         where |= {"va": "top" if below else "bottom", "rotation": 60}
         at = (ends[0] if below else ends[1]) if ends else y

@@ -35,6 +35,7 @@ import numpy as np
 import numpy.typing as npt
 
 import surrogate as sm
+from md_reference.run.config import MDConfig
 from md_reference.run.machine import machine_name
 from md_reference.run.replicas import simulate_batch, simulate_replicas
 from md_reference.simd.force_field import n_replicas
@@ -51,6 +52,7 @@ from surrogate.verbs.run.run_record import RUN_NAME, RunResult
 from surrogate.verbs.simulate import resolve_run
 from systems.errors import SurromdError
 from systems.library.named_scenes import prepare
+from systems.scene import Scene
 from systems.trajectory.checkpoint import checkpoint_path
 from systems.trajectory.codec import open_trajectory
 from systems.units import format_time_ps, parse_time_ps
@@ -72,10 +74,14 @@ MOLECULES = {
     "clopidogrel": ("smiles:COC(=O)[C@H](c1ccccc1Cl)N1CCc2sccc2C1", 900),
     "metoprolol": ("smiles:COCCc1ccc(OC[C@@H](O)CNC(C)C)cc1", 300),
     "chignolin": ("chignolin", 0),
+    "LEU-SER in TIP3P": ("sequence:ACE-LEU-SER-NME", 4),
 }
+SOLVENT = {"LEU-SER in TIP3P": "tip3p"}
 WAYS = {"run": "surromd run", "one": "MD from one start", "many": "MD from many starts", "rollout": "rollout alone"}
 HALVES = "reference's halves"
-KELVIN, SEED, EVERY_PS, BINS, LEFT_OUT_PS = 300.0, 5_000, 10.0, 50, 5_000.0
+KELVIN, SEED, EVERY_PS, BINS = 300.0, 5_000, 10.0, 50
+# Of each replica of the reference, as hot starts are to be forgotten: so much, but no more than a part.
+LEFT_OUT_PS, LEFT_OUT = 5_000.0, 1 / 6
 ENOUGH_R_HAT, HELD = 1.05, 0.95
 # MD from one start that ends before this share of the time that a budget buys is none of that budget's.
 LONG_ENOUGH = 0.9
@@ -85,17 +91,26 @@ EARLIER = "earlier"
 ROLLED_MINUTES = 1.0
 
 
+def plan(name: str, time_ps: float, every_ps: float, seed: int, **how: Any) -> tuple[Scene, MDConfig]:
+    """Return the scene of a molecule and the MD of it, by SIMD replicas."""
+    options = ReferenceOptions(
+        time_ps=time_ps, save_every_ps=every_ps, seed=seed, solvent=SOLVENT.get(name), platform="simd", quiet=True,
+        **how,
+    )  # fmt: skip
+    scene, config, _ = resolve_run(prepare(MOLECULES[name][0]), options, {"time_ps": time_ps}, quiet=True)
+    return scene, config
+
+
 def make_reference(folder: Path, names: Sequence[str], time_ps: float | None, every_ps: float) -> None:
     """Make the reference of every molecule, by default as long as its slowest process needs."""
     for name in names:
-        source, ns = MOLECULES[name]
+        ns = MOLECULES[name][1]
         if not ns:
             continue
         files = [folder / name / f"run_{k:03d}.h5" for k in range(n_replicas())]
         files[0].parent.mkdir(parents=True, exist_ok=True)
         length_ps = 1e3 * ns if time_ps is None else time_ps
-        options = ReferenceOptions(time_ps=length_ps, save_every_ps=every_ps, seed=SEED, platform="simd", quiet=True)
-        scene, config, _ = resolve_run(prepare(source), options, {"time_ps": length_ps}, quiet=True)
+        scene, config = plan(name, length_ps, every_ps, SEED)
         simulate_replicas(scene, config, files, resume=True)
         said(f"{name}: {len(files)} replicas of {format_time_ps(length_ps)}")
 
@@ -106,10 +121,7 @@ def make_longer(folder: Path, names: Sequence[str], time_ps: float, every_ps: fl
         before = finished(folder / name)
         files = [folder / name / LONGER / path.name for path in before]
         files[0].parent.mkdir(exist_ok=True)
-        options = ReferenceOptions(
-            time_ps=time_ps, save_every_ps=every_ps, seed=SEED + 500, platform="simd", quiet=True
-        )
-        scene, config, _ = resolve_run(prepare(MOLECULES[name][0]), options, {"time_ps": time_ps}, quiet=True)
+        scene, config = plan(name, time_ps, every_ps, SEED + 500)
         simulate_batch(scene, config, files, resume=True, starts_nm=np.array([last_frame(path) for path in before]))
         said(f"{name}: {format_time_ps(time_ps)} more")
 
@@ -128,7 +140,10 @@ def make_runs(folder: Path, names: Sequence[str], minutes: Sequence[float]) -> N
             if is_there and RunResult.of(out)["outcome"]:
                 continue
             try:
-                sm.run(MOLECULES[name][0], out, budget_s=60.0 * budget, quiet=True, resume=is_there)
+                sm.run(
+                    MOLECULES[name][0], out, budget_s=60.0 * budget, solvent=SOLVENT.get(name), quiet=True,
+                    resume=is_there,
+                )  # fmt: skip
             except SurromdError as error:  # its line of the table stays empty, and the next time it goes on
                 said(f"{out}: {error}")
             said(f"{name}: {budget:g} min")
@@ -144,11 +159,7 @@ def make_rivals(folder: Path, names: Sequence[str], most_minutes: float) -> None
         longest = max(md_length_ps(r, m) for r, m in rates)
         place = folder / name / "one"
         place.mkdir(exist_ok=True)
-        options = ReferenceOptions(
-            time_ps=EVERY_PS * math.ceil(longest / EVERY_PS), save_every_ps=EVERY_PS, seed=SEED + 900, platform="simd",
-            starts="one", quiet=True,
-        )  # fmt: skip
-        scene, config, _ = resolve_run(prepare(MOLECULES[name][0]), options, {"time_ps": options.time_ps}, quiet=True)
+        scene, config = plan(name, EVERY_PS * math.ceil(longest / EVERY_PS), EVERY_PS, SEED + 900, starts="one")
         simulate_replicas(scene, config, [place / f"run_{k:03d}.h5" for k in range(n_replicas())], resume=True)
         rolls = rates[-1][0]["rolls"]
         first = folder / name / "rollout" / "rolled_r0.h5"
@@ -160,7 +171,7 @@ def make_rivals(folder: Path, names: Sequence[str], most_minutes: float) -> None
             out.parent.mkdir(exist_ok=True)
             sm.rollout(
                 MOLECULES[name][0], rolls["weights"], out, time_ps=time_ps, save_every_ps=every_ps,
-                replicas=rolls["replicas"], seed=SEED, resume=True, quiet=True,
+                replicas=rolls["replicas"], solvent=SOLVENT.get(name), seed=SEED, resume=True, quiet=True,
             )  # fmt: skip
         said(f"{name}: rivals")
 
@@ -198,9 +209,9 @@ class LongMD:
 
     @classmethod
     def of(cls, files: Sequence[Path]) -> LongMD:
-        """Return what files of replicas tell; the first part of each is left out, as hot starts are to be forgotten."""
+        """Return what files of replicas tell, without the first part of each."""
         whole = load_ensemble(files)
-        ensemble = stretch(whole, round(LEFT_OUT_PS / whole.lag_ps), None)
+        ensemble = stretch(whole, round(left_out_ps(whole) / whole.lag_ps), None)
         if longer := sorted((files[0].parent / LONGER).glob("[!.]*.h5")):
             later = load_ensemble(longer, template=whole.scene)
             every = round(later.lag_ps / ensemble.lag_ps)
@@ -222,7 +233,8 @@ class LongMD:
     def errors_of_beginning(self, first_ps: float) -> tuple[float, float]:
         """Return the errors of the first part of the reference's own replicas, beside the rest of it."""
         own = self.load(self.files, first_ps)
-        n = max(0, round((len(own.segments[0]) * own.lag_ps - LEFT_OUT_PS) / self.ensemble.lag_ps))
+        gone_ps = left_out_ps(self.load(self.files))
+        n = max(0, round((len(own.segments[0]) * own.lag_ps - gone_ps) / self.ensemble.lag_ps))
         rest = {k: [x[n:] for x in segments] for k, segments in self.angles.items()}
         angles, weights = measured(self.baseline, own), own_weights(own)
         return torsion_distance(rest, angles, weights), population_error(rest, angles, weights)
@@ -231,6 +243,10 @@ class LongMD:
         """Return the distance of torsions, and the error of populations in per cent."""
         angles = measured(self.baseline, of)
         return torsion_distance(self.angles, angles, weights), population_error(self.angles, angles, weights)
+
+
+def left_out_ps(whole: Ensemble) -> float:
+    return min(LEFT_OUT_PS, LEFT_OUT * len(whole.segments[0]) * whole.lag_ps)
 
 
 def stretch(ensemble: Ensemble, first: int, last: int | None) -> Ensemble:
