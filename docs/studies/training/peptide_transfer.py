@@ -2,12 +2,14 @@
 
     python docs/studies/training/peptide_transfer.py OUT.safetensors --train FOLDER [FOLDER ...] --budget 1h
                [--start WEIGHTS] [--tuned all|flow|states] [--coupled] [--runs 16] [--steps N] [--unseen 12] [--half]
+    python docs/studies/training/peptide_transfer.py OUT.safetensors --train FOLDER [FOLDER ...] --start WEIGHTS --pace
 
 FOLDER: `train` in a folder of `peptide_campaign` or `peptide_runs`, of each molecule in it the first `--runs`. `flow`
 and `states` train the flow or the probabilities of torsion states alone, and need `--start`. `--unseen`: every so many
 molecules of several residues one is left out, and the curves show its loss. `--half` rounds to float16 at the end. Free
 energies of φ > 0 are those of `peptide_energies` beside OUT, or those that the weights gone on from were trained with.
-A training that was stopped goes on.
+A training that was stopped goes on. `--pace` trains nothing: how often ψ changes its state in the solvent of the runs
+is set to what they show, by one factor for all residues (`balance.set_pace`).
 """
 
 from __future__ import annotations
@@ -17,18 +19,21 @@ import sys
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from peptide_energies import known_energies
 from peptide_list import RESIDUES, held_out_peptides, unseen_peptides
 from processes import is_trained
 
-from surrogate.data import Split, TrainingFrames, collect_frames
+from surrogate.data import FrameSets, Split, TrainingFrames, collect_frames
 from surrogate.models.architecture import weights_path
-from surrogate.models.peptides.layout import PeptideConfig
-from surrogate.models.peptides.trainer import TUNED, PeptideTraining, train_peptides
-from surrogate.models.weights import load_weights, save_weights
+from surrogate.models.peptides.balance import set_pace
+from surrogate.models.peptides.layout import PeptideConfig, chain_features
+from surrogate.models.peptides.model import PeptideSlide
+from surrogate.models.peptides.subjects import PeptideSubject
+from surrogate.models.peptides.trainer import TUNED, PeptideTraining, peptides_domain, train_peptides
+from surrogate.models.weights import Weights, load_weights, provenance_of, save_weights
 from systems.errors import InputError
 from systems.units import parse_wall_s
 
@@ -63,6 +68,17 @@ def trained_with(provenance: dict[str, Any] | None) -> dict[str, float]:
     return {}
 
 
+def with_pace(sets: Sequence[TrainingFrames], start: Weights, energies: dict[str, float], out: Path) -> None:
+    """Write weights with the pace of psi that frames show."""
+    model = cast(PeptideSlide, start.model)
+    chains = [chain_features(f.scene, model.config, f.conditions.get("solvent")) for f in sets]
+    subjects = [PeptideSubject(f, chain).in_equilibrium(energies) for f, chain in zip(sets, chains, strict=True)]
+    set_pace(model, subjects)
+    domain = peptides_domain(sets, model.config, start.domain)
+    provenance = provenance_of(FrameSets(tuple(sets)).origin, {"tuned": "pace"}, start)
+    save_weights(out, model, domain, provenance, half=True)
+
+
 def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("out", type=Path)
@@ -75,6 +91,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--budget", type=lambda text: parse_wall_s(text, "--budget"))
     parser.add_argument("--steps", type=int)
     parser.add_argument("--half", action="store_true")
+    parser.add_argument("--pace", action="store_true")
     a = parser.parse_args(arguments)
     if is_trained(a.out):
         return
@@ -89,6 +106,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
     sys.stdout.write(f"{len(sets)} sets of runs, {total_us:.3g} µs; left out: {', '.join(left) or 'none'}\n")
     start = None if a.start is None else load_weights(weights_path(a.start))
     energies = known_energies(a.out.parent) or trained_with(None if start is None else start.provenance)
+    if a.pace:
+        assert start is not None
+        with_pace(sets, start, energies, a.out)
+        return
     training = PeptideTraining(
         budget_s=a.budget, steps=a.steps, time_reversal=True, positive_phi_kt=energies, tuned=a.tuned,
         validate_every_s=_VALIDATE_S,

@@ -38,6 +38,8 @@ _RIDGE, _MOST = 0.3, 3.0
 # level says for all peptides is from each, and what holds levels near zero.
 _FRAMES, _STEP_PS, _STEPS = 1000, 10.0, (2, 10)
 _CHANGES_PASSES, _MOLECULES_DIFFER, _CHANGES_RIDGE = 3, 0.1, 5.0
+# Where psi stands among torsions.
+_PSI = 1
 # Neighbours that are no residues: free ends and caps.
 _ENDS = (*ENDS, "ACE", "NME")
 
@@ -101,6 +103,22 @@ def _balance(model: PeptideSlide, jumps: StateJumps, subjects: Sequence[PeptideS
     types = [phi.chain.places[phi.residue, :3].tolist() for phi in phis]
     for _ in range(_PASSES if phis else 0):
         jumps.raise_change(0, 0, 1, _levels(jumps, types, [lacking_entries(model, phi) for phi in phis], _RIDGE))
+
+
+@torch.no_grad()
+def set_pace(model: PeptideSlide, subjects: Sequence[PeptideSubject]) -> None:
+    """Move how often psi changes its state, of all residues in a solvent by one factor, to what the runs of `subjects`
+    in it show. A few ns of each say no more: not which side is likelier, nor how residues differ."""
+    for solvent, jumps in enumerate(cast(list[StateJumps], list(model.all_jumps))):
+        some = [s for s in subjects if s.chain.solvent == solvent]
+        for _ in range(_CHANGES_PASSES if some else 0):
+            found = [change for subject in some for change in changes(model, subject) if change.torsion == _PSI]
+            counted = sum(change.counted for change in found)
+            slow = sum(change.counted * change.slow for change in found) / (counted + _CHANGES_RIDGE)
+            levels = jumps.of_change.new_zeros(3, jumps.of_change.shape[1])
+            levels[0] = slow
+            for a, b in ((0, 1), (1, 0)):
+                jumps.raise_change(_PSI, a, b, levels)
 
 
 def _levels(jumps: StateJumps, types: Sequence[Sequence[int]], lacking: Sequence[float], ridge: float) -> Tensor:

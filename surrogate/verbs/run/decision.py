@@ -44,6 +44,8 @@ _TOGETHER = "MD and a rollout together"
 _PAYS = 0.9
 MD_STAGES: tuple[Stage, ...] = ("md", "held-out md")
 LEAST_BUDGET_S = 20.0
+# Of a replica in explicit water.
+_LEAST_MD_FRAMES = 4
 # Of a budget: what is planned with, for stages take a while to stop.
 _AIM = 0.97
 # In fewer a stage that goes on makes nothing more, or one of MD begins in vain.
@@ -142,8 +144,13 @@ def _shares(rates: Rates, way: Way, budget_s: float, left_s: float) -> dict[Stag
 
 
 def least_budget_s(rates: Rates) -> float:
-    """Return the wall seconds in which a run comes to anything; a machine that is busy now may not be in a while."""
-    return LEAST_BUDGET_S * min(rates.stretch, 2.0)
+    """Return the wall seconds in which a run comes to anything; a machine that is busy now may not be in a while. In
+    explicit water MD, which has half of them, begins late and is slow."""
+    md_s = rates.begins_s
+    if rates.explicit:
+        base_ps = _base_ps(rates, "md" if rates.rolls is None else "rollout")
+        md_s += _LEAST_MD_FRAMES * base_ps * rates.replicas / rates.md_ps_per_s
+    return LEAST_BUDGET_S * min(rates.stretch, 2.0) + 2.0 * md_s
 
 
 def _report_s(rates: Rates) -> tuple[float, float]:

@@ -37,6 +37,8 @@ _CHUNKS = 6
 # Taken for the slowest relaxation of what nothing has been seen of: ps.
 UNSEEN_PS = 1000.0
 _LONGEST_STRETCH = 30.0
+# Steps of OpenMM that minimising the energy of a cell of water costs, and ps of a replica that it takes to begin.
+_MINIMISED_STEPS, _BEGINS_PS = 500, 16.0
 # Beyond this SIMD replicas are not tried: all compute the same pairs of waters, the more in vain the larger the cell.
 _MOST_ATOMS_BY_SIMD = 3000
 
@@ -62,7 +64,7 @@ class Rates:
     core; `md_ps_per_s`: of MD on all cores in a second of wall time, by the fastest way: on this `platform`, `at_once`
     replicas on each core; `md`: in words; `expensive`: it is quantum mechanics. `rolls`: of weights that cover the
     scene, None where none do; `coverage`: why these, or none. `without_simd`: why MD is not run by SIMD, where it might
-    have been; `in_water`: in ALPB water, in which no potential learns.
+    have been; `in_water`: in ALPB water, in which no potential learns; `explicit`: in a cell of water.
     """
 
     n_atoms: int
@@ -79,6 +81,7 @@ class Rates:
     at_once: int = 1
     without_simd: str = ""
     in_water: bool = False
+    explicit: bool = False
 
     @property
     def replicas(self) -> int:
@@ -101,6 +104,14 @@ class Rates:
         seen = "as the first rollouts show" if self.rolls and self.rolls.relaxation_ps else "assumed"
         usual = f", that of states {format_time_ps(self.usual_ps, 2)}" if self.usual_ps != self.relaxation_ps else ""
         return f"a slowest relaxation of {format_time_ps(self.relaxation_ps, 2)}{usual}, {seen}"
+
+    @property
+    def begins_s(self) -> float:
+        """Wall seconds, about, before MD in explicit water makes frames: its energy is minimised, replicas are turned
+        to torsions of their own and come to equilibrium, all for as short as may be."""
+        if not self.explicit:
+            return 0.0
+        return _MINIMISED_STEPS * self.step_s * self.stretch + _BEGINS_PS * self.replicas / self.md_ps_per_s
 
     @property
     def openmm_ps_per_s(self) -> float:
@@ -128,7 +139,7 @@ def measure(scene: Scene, config: MDConfig, named: str | Path | None, cores: int
     rates = Rates(
         n_atoms=_n_written(scene, by_openmm), cores=cores, stretch=stretch,
         expensive=config.force.force_field == QUANTUM, in_water=config.force.solvent in QUANTUM_SOLVENTS,
-        md=plan.line, step_s=plan.us_per_step * 1e-6,
+        explicit=config.force.is_explicit, md=plan.line, step_s=plan.us_per_step * 1e-6,
         timestep_ps=config.timestep_ps, md_ps_per_s=0.0, coverage=coverage, platform=by_openmm.platform,
         rolls=None if weights is None else rollout_rate(dry, weights, config.temperature_k, stretch, cores),
     )  # fmt: skip

@@ -189,5 +189,18 @@ def test_a_budget_in_which_nothing_can_be_evaluated_is_refused() -> None:
     decide(COVERED, 22.0)
 
 
+def test_a_budget_in_explicit_water_is_enough_for_md_to_begin() -> None:
+    # LEU-SER in TIP3P on one core: sixteen replicas make 16.4 ps a second, and take 16 ps each to begin.
+    dry = replace(COVERED, cores=1, step_s=3.2e-3, md_ps_per_s=16.4, platform="simd", at_once=16,
+                  rolls=Rolls("peptides", 10.0, 30_000.0, 8, 480.0, 130.0))  # fmt: skip
+    wet = replace(dry, explicit=True)
+    assert decide(dry, 60.0).seconds("held-out md") > 0.0 and dry.begins_s == 0.0
+    assert wet.begins_s == pytest.approx(1.6 + 16 * 16.0 / 16.4)
+    with pytest.raises(InputError, match=r"a budget of 60 s is too short: .* takes 2\.21 min .* Use `budget_s='140s'`"):
+        decide(wet, 60.0)
+    md_s = decide(wet, 140.0).seconds("held-out md")
+    assert md_s > wet.begins_s + 4 * 10.0 * 16 / 16.4, "four frames of each replica, if MD has half of the time"
+
+
 def test_a_budget_that_is_not_given_is_ten_minutes() -> None:
     assert RunOptions().budget_s == 600.0 and RunOptions(budget_s=60.0).budget_s == 60.0

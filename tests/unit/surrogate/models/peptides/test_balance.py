@@ -10,7 +10,7 @@ import torch
 
 from small_scenes import with_phi_turned
 from surrogate.data import TrainingFrames, canonicalise, quantise
-from surrogate.models.peptides.balance import balance, changes, lacking_entries, weighted_phis
+from surrogate.models.peptides.balance import balance, changes, lacking_entries, set_pace, weighted_phis
 from surrogate.models.peptides.layout import PeptideConfig, chain_features
 from surrogate.models.peptides.model import PeptideSlide
 from surrogate.models.peptides.subjects import PeptideSubject
@@ -114,6 +114,28 @@ def test_a_solvent_is_balanced_by_frames_in_it() -> None:
     assert torch.equal(model.jumps.of_change, dry)
     assert not torch.equal(model.jumps_elsewhere[0].of_change, water)
     assert max(abs(change.lacking) for change in changes(model, wet)) < 0.5 * max(before)
+
+
+def test_the_pace_is_one_factor_for_all_residues_of_a_solvent() -> None:
+    sets = [_jumping(_frames(f"ACE-{name}-NME", kind="psi"), often, 0.05)
+            for name, often in (("ALA", 0.1), ("SER", 0.2))]  # fmt: skip
+    config = PeptideConfig(width=16, n_layers=1, n_heads=1, chunk_frames=4, solvents=("obc2", "tip3p"))
+    config = with_scale(config, sets)
+    subjects = [PeptideSubject(f, chain_features(f.scene, config, "tip3p"), np.ones(2 * EACH)) for f in sets]
+    torch.manual_seed(0)
+    model = PeptideSlide(config).requires_grad_(False)
+    dry, wet = model.jumps.of_change.clone(), model.jumps_elsewhere[0].of_change.clone()
+
+    def slow() -> float:
+        return float(np.mean([change.slow for subject in subjects for change in changes(model, subject)]))
+
+    assert slow() > 1.0
+    set_pace(model, subjects)
+    assert abs(slow()) < 0.2
+    moved = (model.jumps_elsewhere[0].of_change - wet)[0]
+    assert torch.equal(model.jumps.of_change, dry) and moved[0, 1, 0, 1] > 1.0
+    assert moved[:, 1, 0, 1].unique().allclose(moved[0, 1, 1, 0]), "of either direction, of residues not seen too"
+    assert not moved[:, [0, *range(2, moved.shape[1])]].any(), "of psi alone"
 
 
 def test_how_likely_the_rare_side_is_sets_the_probabilities() -> None:
