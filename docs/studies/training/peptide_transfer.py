@@ -8,8 +8,8 @@ FOLDER: `train` in a folder of `peptide_campaign` or `peptide_runs`, of each mol
 and `states` train the flow or the probabilities of torsion states alone, and need `--start`. `--unseen`: every so many
 molecules of several residues one is left out, and the curves show its loss. `--half` rounds to float16 at the end. Free
 energies of φ > 0 are those of `peptide_energies` beside OUT, or those that the weights gone on from were trained with.
-A training that was stopped goes on. `--pace` trains nothing: how often ψ changes its state in the solvent of the runs
-is set to what they show, by one factor for all residues (`balance.set_pace`).
+A training that was stopped goes on. `--pace` trains nothing: how often ψ changes its state beside other residues, in
+the solvent of the runs, is set to what they show, by one factor a side (`balance.set_pace`).
 """
 
 from __future__ import annotations

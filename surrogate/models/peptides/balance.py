@@ -87,9 +87,14 @@ def balance(model: PeptideSlide, subjects: Sequence[PeptideSubject]) -> None:
         _balance(model, cast(StateJumps, jumps), [s for s in subjects if s.chain.solvent == solvent])
 
 
+def _ends(model: PeptideSlide) -> list[int]:
+    """Return the types that are no residues."""
+    return [k for k, name in enumerate((*ENDS, *model.config.types)) if name in _ENDS]
+
+
 def _balance(model: PeptideSlide, jumps: StateJumps, subjects: Sequence[PeptideSubject]) -> None:
     """Do so in one solvent."""
-    ends = torch.tensor([k for k, name in enumerate((*ENDS, *model.config.types)) if name in _ENDS])
+    ends = torch.tensor(_ends(model))
     for _ in range(_CHANGES_PASSES):
         found: dict[tuple[int, int, int], list[Change]] = {}
         for change in (change for subject in subjects for change in changes(model, subject)):
@@ -107,16 +112,19 @@ def _balance(model: PeptideSlide, jumps: StateJumps, subjects: Sequence[PeptideS
 
 @torch.no_grad()
 def set_pace(model: PeptideSlide, subjects: Sequence[PeptideSubject]) -> None:
-    """Move how often psi changes its state, of all residues in a solvent by one factor, to what the runs of `subjects`
-    in it show. A few ns of each say no more: not which side is likelier, nor how residues differ."""
+    """Move how often psi changes its state beside other residues, by one factor for any residue before it and one for
+    any after, to what the runs of `subjects` in a solvent show. A few ns of each say no more: not which side is
+    likelier, nor how residues differ. Residues between caps keep their pace."""
+    ends = _ends(model)
     for solvent, jumps in enumerate(cast(list[StateJumps], list(model.all_jumps))):
         some = [s for s in subjects if s.chain.solvent == solvent]
         for _ in range(_CHANGES_PASSES if some else 0):
             found = [change for subject in some for change in changes(model, subject) if change.torsion == _PSI]
-            counted = sum(change.counted for change in found)
-            slow = sum(change.counted * change.slow for change in found) / (counted + _CHANGES_RIDGE)
+            beside = torch.tensor([[kind not in ends for kind in change.types[1:]] for change in found]).double()
+            factors = _nearest(beside, found, [change.slow for change in found])
             levels = jumps.of_change.new_zeros(3, jumps.of_change.shape[1])
-            levels[0] = slow
+            levels[1:] = factors[:, None]
+            levels[1:, ends] = 0.0
             for a, b in ((0, 1), (1, 0)):
                 jumps.raise_change(_PSI, a, b, levels)
 
@@ -135,17 +143,22 @@ def _own_levels(jumps: StateJumps, ends: Tensor, some: Sequence[Change], lacking
     beside caps and at free ends, which have the types `ends`, then each. Levels of other neighbours stay: moved so,
     they bring peptides that are left out farther from what they lack."""
     has = F.one_hot(torch.tensor([c.types for c in some]), jumps.of_change.shape[1]).double()
-    counted = torch.tensor([c.counted for c in some], dtype=torch.float64)
-    left, levels = torch.tensor(lacking, dtype=torch.float64).clamp(-_MOST, _MOST), torch.zeros(3, has.shape[2])
+    left, levels = [max(-_MOST, min(x, _MOST)) for x in lacking], torch.zeros(3, has.shape[2])
     found = []
     for part in (has[:, 0].sum(1, keepdim=True), has[:, 1:][..., ends].flatten(1), has[:, 0]):
-        weighed = counted * part.T
-        held = weighed @ part + _CHANGES_RIDGE * torch.eye(part.shape[1], dtype=torch.float64)
-        found.append(torch.linalg.solve(held, weighed @ left).float())
-        left = left - part @ found[-1].double()
+        found.append(_nearest(part, some, left))
+        left = (torch.tensor(left, dtype=torch.float64) - part @ found[-1].double()).tolist()
     levels[0] = found[0] + found[2]
     levels[1:, ends] = found[1].reshape(2, -1)
     return levels.to(jumps.of_change.device)
+
+
+def _nearest(part: Tensor, some: Sequence[Change], lacking: Sequence[float]) -> Tensor:
+    """Return what of each column of `part` (n, k), float64, adds up nearest to what is `lacking` (n,): least squares,
+    held near zero."""
+    weighed = torch.tensor([c.counted for c in some], dtype=torch.float64) * part.T
+    held = weighed @ part + _CHANGES_RIDGE * torch.eye(part.shape[1], dtype=torch.float64)
+    return torch.linalg.solve(held, weighed @ torch.tensor(lacking, dtype=torch.float64)).float()
 
 
 @torch.no_grad()

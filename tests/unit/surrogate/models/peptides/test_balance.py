@@ -116,26 +116,28 @@ def test_a_solvent_is_balanced_by_frames_in_it() -> None:
     assert max(abs(change.lacking) for change in changes(model, wet)) < 0.5 * max(before)
 
 
-def test_the_pace_is_one_factor_for_all_residues_of_a_solvent() -> None:
+def test_the_pace_beside_other_residues_is_one_factor_a_side() -> None:
     sets = [_jumping(_frames(f"ACE-{name}-NME", kind="psi"), often, 0.05)
-            for name, often in (("ALA", 0.1), ("SER", 0.2))]  # fmt: skip
+            for name, often in (("ALA-SER", 0.1), ("SER-ALA", 0.2), ("SER", 0.2))]  # fmt: skip
     config = PeptideConfig(width=16, n_layers=1, n_heads=1, chunk_frames=4, solvents=("obc2", "tip3p"))
     config = with_scale(config, sets)
     subjects = [PeptideSubject(f, chain_features(f.scene, config, "tip3p"), np.ones(2 * EACH)) for f in sets]
     torch.manual_seed(0)
     model = PeptideSlide(config).requires_grad_(False)
-    dry, wet = model.jumps.of_change.clone(), model.jumps_elsewhere[0].of_change.clone()
+    jumps, start = model.jumps_elsewhere[0], {name: x.clone() for name, x in model.named_parameters()}
 
-    def slow() -> float:
-        return float(np.mean([change.slow for subject in subjects for change in changes(model, subject)]))
+    def slow(some: list[PeptideSubject]) -> float:
+        return float(np.mean([change.slow for subject in some for change in changes(model, subject)]))
 
-    assert slow() > 1.0
-    set_pace(model, subjects)
-    assert abs(slow()) < 0.2
-    moved = (model.jumps_elsewhere[0].of_change - wet)[0]
-    assert torch.equal(model.jumps.of_change, dry) and moved[0, 1, 0, 1] > 1.0
-    assert moved[:, 1, 0, 1].unique().allclose(moved[0, 1, 1, 0]), "of either direction, of residues not seen too"
-    assert not moved[:, [0, *range(2, moved.shape[1])]].any(), "of psi alone"
+    pairs, alone = slow(subjects[:2]), slow(subjects[2:])
+    assert min(pairs, alone) > 1.0
+    set_pace(model, subjects[:2])
+    assert abs(slow(subjects[:2])) < 0.2 * pairs and slow(subjects[2:]) == alone, "beside caps it stays"
+    moved = {name for name, x in model.named_parameters() if not torch.equal(x, start[name])}
+    assert moved == {"jumps_elsewhere.0.beside_change"}
+    of = {name: jumps.beside_change[:, 2 + config.types.index(name), 1] for name in config.types}
+    assert of["ALA"].equal(of["SER"]) and not of["ACE"].any() and not of["NME"].any()
+    assert of["ALA"][:, 0, 1].equal(of["ALA"][:, 1, 0]), "either direction alike"
 
 
 def test_how_likely_the_rare_side_is_sets_the_probabilities() -> None:
