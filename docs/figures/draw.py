@@ -105,7 +105,6 @@ def draw_water(rates: dict[str, Any], populations: dict[str, Any], out: Path) ->
     _, low, high = rows.pop((rates["rows"][0][0], ""))[0]
     both[0].axhspan(low, high, color="0.9")
     implicit = rows.pop((rates["rows"][1][0], ""))
-    rows = {key: found for key, found in rows.items() if key[1]}  # the shipped weights learned from other MD, too
     least = min(float(ns) for _, ns in rows if float(ns))
     for axes, value, label in ((both[0], implicit[0][0], "MD in OBC2"), (both[1], implicit[1], None)):
         axes.axhline(1.0, color="black", lw=0.8, zorder=0)

@@ -3,16 +3,17 @@
     python docs/studies/training/peptide_water.py train FOLDER WATER OBC2 [--start W] [--runs 1 4 16]
                [--methods new states whole joint] [--steps 600]
     python docs/studies/training/peptide_water.py table FOLDER WATER OBC2 [--start W]
+    python docs/studies/training/peptide_water.py shipped FOLDER WATER [--earlier W]
 
 WATER and OBC2 are folders of `peptide_campaign`: what is in WATER/train is learned from, of each molecule so many runs,
 and what is in WATER/test is rolled as often and as long, from the same first frames. Weights W, for OBC2, are taken as
 they are (`unchanged`); their frames are weighed and their time is stretched as monomers in both solvents say
 (`corrected`, `peptide_correction`); they are trained further, `whole`, or the probabilities of `states` alone, or whole
 on both folders (`joint`); and weights are trained `new`, from nothing. `train` makes FOLDER/METHOD-RUNS.safetensors,
-one after the other in one process a core; what is there stays. `table` rolls them all, and the shipped weights where
-these know water, beside MD in both solvents: how far torsions are from MD's in water (`peptide_unseen`, pooled), of
-every ψ the share of time in helices and how often it crosses to the other basin or back, this over MD's in the
-geometric mean, and the pace over that of MD by SIMD replicas on the same core.
+one after the other in one process a core; what is there stays. `table` rolls them all beside MD in both solvents: how
+far torsions are from MD's in water (`peptide_unseen`, pooled), of every ψ the share of time in helices and how often it
+crosses to the other basin or back, this over MD's in the geometric mean, and the pace over that of MD by SIMD replicas
+on the same core. `shipped` tells the same of the shipped weights, and of earlier ones, in water alone.
 """
 
 from __future__ import annotations
@@ -45,6 +46,7 @@ from systems.trajectory.codec import open_trajectory
 
 FloatArray = npt.NDArray[np.float64]
 SHIPPED = "peptides"
+_WHAT = ("weights for OBC2", "MD, ns")
 TABLES = Path(__file__).parents[2] / "results" / "tables"
 # By what follows `peptide_transfer`: whether it goes on from weights, and what is tuned of these.
 TRAINED = {"new": None, "states": "states", "whole": "all", "joint": "all"}
@@ -95,10 +97,11 @@ class Molecule(NamedTuple):
     md_file: Path
 
     @classmethod
-    def of(cls, water: Path, obc2: Path, name: str) -> Molecule:
+    def of(cls, water: Path, obc2: Path | None, name: str) -> Molecule:
         files = sorted((water / "test" / name).glob("run_*.h5"))
         scene, frames, time_ps = thinned(files)
-        turns, implicit = turns_of(scene), thinned(sorted((obc2 / "test" / name).glob("run_*.h5")))[1]
+        turns, dry = turns_of(scene), [] if obc2 is None else sorted((obc2 / "test" / name).glob("run_*.h5"))
+        implicit = thinned(dry)[1] if dry else []
         md, in_obc2 = ([angles(turns, x) for x in some] for some in (frames, implicit))
         return cls(name, scene, turns, md, in_obc2, np.stack([x[0] for x in frames]), time_ps, files[0])
 
@@ -169,74 +172,105 @@ def row(
     return [words, learned, *often, f"{mean} [{low}, {high}]"], [words, learned, f"{np.mean(apart):.2f}", *helices]
 
 
-def make_table(folder: Path, water: Path, obc2: Path, start: str, out: Path) -> None:
-    tests = [Molecule.of(water, obc2, place.name) for place in sorted((water / "test").iterdir())
-             if len(list(place.glob("run_*.h5"))) >= 4]  # fmt: skip
-    paces = {m.name: pace(m.scene, m.starts_nm[0], m.md_file) for m in tests}
-    correction = Correction.of(water / "train", obc2 / "train")
+class Tests(NamedTuple):
+    """The molecules that are tested by, and how fast a core simulates each by SIMD replicas."""
 
-    def even(some: Sequence[list[FloatArray]]) -> list[tuple[Molecule, list[FloatArray], list[FloatArray]]]:
-        return [(m, runs, [np.ones(len(x)) for x in runs]) for m, runs in zip(tests, some, strict=True)]
+    molecules: list[Molecule]
+    paces: dict[str, float]
 
-    def roll(path: Path, solvent: str | None) -> tuple[list[list[FloatArray]], str]:
+    @classmethod
+    def of(cls, water: Path, obc2: Path | None = None) -> Tests:
+        found = [Molecule.of(water, obc2, place.name) for place in sorted((water / "test").iterdir())
+                 if len(list(place.glob("run_*.h5"))) >= 4]  # fmt: skip
+        return cls(found, {m.name: pace(m.scene, m.starts_nm[0], m.md_file) for m in found})
+
+    def even(self, some: Sequence[list[FloatArray]]) -> list[tuple[Molecule, list[FloatArray], list[FloatArray]]]:
+        return [(m, runs, [np.ones(len(x)) for x in runs]) for m, runs in zip(self.molecules, some, strict=True)]
+
+    def roll(self, path: Path, folder: Path, solvent: str | None) -> tuple[list[list[FloatArray]], str]:
         """Return what weights roll, and how many times faster than MD by SIMD replicas on this core."""
-        weights, found, faster = load_weights(path), [], []
-        for m in tests:
+        weights, faster = load_weights(path), []
+        found: list[list[FloatArray]] = []
+        for m in self.molecules:
             outs = [folder / path.stem / m.name / f"{k:02d}.h5" for k in range(len(m.md))]
             if free_ends(m.scene.residue_names) and not any(map(free_ends, weights.domain.peptides)):
                 found.append([])
                 continue
             frames = rolled(weights, m.scene, outs, m.time_ps, FRAMES_PS, solvent, m.starts_nm)
             found.append([angles(m.turns, x) for x in frames])
-            faster.append(m.time_ps / spent_s(outs[0]) / paces[m.name])
+            faster.append(m.time_ps / spent_s(outs[0]) / self.paces[m.name])
         return found, f"{float(f'{np.mean(faster):.2g}'):,.0f}"
 
-    unchanged, faster = roll(weights_path(start), None)
+    @property
+    def psi(self) -> list[str]:
+        return [name for m in self.molecules for name in m.psi]
+
+    @property
+    def lengths(self) -> str:
+        return "; ".join(f"{len(m.md)} runs of {1e-3 * m.time_ps:.2g} ns of {m.name}" for m in self.molecules)
+
+
+def write(out: Path, columns: Sequence[str], rows: Sequence[Sequence[str]], words: str, note: str) -> None:
+    about = {"command": f"python docs/studies/training/peptide_water.py {words}", "machine": machine_name()}
+    table = {"columns": columns, "rows": rows, **about, "note": note}
+    out.write_text(json.dumps(table, ensure_ascii=False, indent=1) + "\n", "utf-8")
+    for line in rows:
+        sys.stdout.write(" | ".join(line) + "\n")
+
+
+def make_table(folder: Path, water: Path, obc2: Path, start: str, out: Path) -> None:
+    tests = Tests.of(water, obc2)
+    correction = Correction.of(water / "train", obc2 / "train")
+    unchanged, faster = tests.roll(weights_path(start), folder, None)
     weighed = [(m, runs, [correction.weights(m.turns, m.residues, x) for x in runs])
-               for m, runs in zip(tests, unchanged, strict=True)]  # fmt: skip
+               for m, runs in zip(tests.molecules, unchanged, strict=True)]  # fmt: skip
     ns = f"{simulated_ns(water / 'train', n_replicas()):.0f}"
     lines = [
-        (*row("MD in TIP3P", "", even([m.md for m in tests])), "1"),
-        (*row("MD in OBC2", "", even([m.in_obc2 for m in tests])), ""),
-        (*row(WORDS["unchanged"], "0", even(unchanged)), faster),
+        (*row("MD in TIP3P", "", tests.even([m.md for m in tests.molecules])), "1"),
+        (*row("MD in OBC2", "", tests.even([m.in_obc2 for m in tests.molecules])), ""),
+        (*row(WORDS["unchanged"], "0", tests.even(unchanged)), faster),
         (*row(WORDS["corrected"], ns, weighed, correction.clock), faster),
     ]
     made = {(list(TRAINED).index(path.stem.split("-")[0]), int(path.stem.split("-")[1])): path
             for path in folder.glob("*-*.safetensors") if is_trained(path)}  # fmt: skip
     for (k, n), path in sorted(made.items()):
         method = list(TRAINED)[k]
-        runs, faster = roll(path, "tip3p" if TRAINED[method] else None)
-        lines.append((*row(WORDS[method], f"{simulated_ns(water / 'train', n):.0f}", even(runs)), faster))
-    if "tip3p" in load_weights(weights_path(SHIPPED)).model.config.solvents:
-        runs, faster = roll(weights_path(SHIPPED), "tip3p")
-        lines.append((*row(f"`{SHIPPED}`, shipped", "", even(runs)), faster))
-    named = [name for m in tests for name in m.psi]
-    about = {
-        "command": f"python docs/studies/training/peptide_water.py table FOLDER WATER OBC2 --start {start}",
-        "machine": machine_name(),
-    }
-    each = "; ".join(f"{len(m.md)} runs of {1e-3 * m.time_ps:.2g} ns of {m.name}" for m in tests)
+        runs, faster = tests.roll(path, folder, "tip3p" if TRAINED[method] else None)
+        lines.append((*row(WORDS[method], f"{simulated_ns(water / 'train', n):.0f}", tests.even(runs)), faster))
     note = (
-        f"{each}. Rollouts from the first frames of MD in TIP3P; MD in OBC2 is longer. Errors over runs, of the "
-        f"geometric mean by counts; means are of capped pairs. Stretched by {correction.clock:.1f}."
+        f"{tests.lengths}. Rollouts from the first frames of MD in TIP3P; MD in OBC2 is longer. Errors over runs, of "
+        f"the geometric mean by counts; means are of capped pairs. Stretched by {correction.clock:.1f}."
     )
-    for path, columns, rows in (
-        (out, [*named, "over MD's"], [of_rates for of_rates, *_ in lines]),
-        (out.with_stem(f"{out.stem}_helices"), ["torsions, pooled", *named, "pace"],
-         [[*of_helices, faster] for _, of_helices, faster in lines]),
-    ):  # fmt: skip
-        table = {"columns": ["weights for OBC2", "MD, ns", *columns], "rows": rows, **about, "note": note}
-        path.write_text(json.dumps(table, ensure_ascii=False, indent=1) + "\n", "utf-8")
-        for line in rows:
-            sys.stdout.write(" | ".join(line) + "\n")
+    words = f"table FOLDER WATER OBC2 --start {start}"
+    write(out, [*_WHAT, *tests.psi, "over MD's"], [of_rates for of_rates, *_ in lines], words, note)
+    populations = [[*of_helices, faster] for _, of_helices, faster in lines]
+    columns = [*_WHAT, "torsions, pooled", *tests.psi, "pace"]
+    write(out.with_stem(f"{out.stem}_helices"), columns, populations, words, note)
+
+
+def shipped_table(folder: Path, water: Path, earlier: str | None, out: Path) -> None:
+    """Lay the shipped weights, and earlier ones, beside MD in water: crossings, then distances and populations."""
+    tests = Tests.of(water)
+    of_md = tests.even([m.md for m in tests.molecules])
+    lines = [(*row("MD in TIP3P", "", of_md), "1")]
+    for words, name in (("earlier ones", earlier), (f"`{SHIPPED}`, shipped", SHIPPED)):
+        if name is not None:
+            runs, faster = tests.roll(weights_path(name), folder, "tip3p")
+            lines.append((*row(words, "", tests.even(runs)), faster))
+    helices = [f"helices, {name}, %" for name in tests.psi]
+    columns = ["weights", *tests.psi, "over MD's", "torsions, pooled", *helices, "pace"]
+    note = f"{tests.lengths}. Rollouts from the same first frames. Errors over runs, of the geometric mean by counts."
+    rows = [[words, *rates, *shares, faster] for (words, _, *rates), (_, _, *shares), faster in lines]
+    write(out, columns, rows, "shipped FOLDER WATER" + " --earlier EARLIER.safetensors" * (earlier is not None), note)
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("what", choices=("train", "table"))
+    parser.add_argument("what", choices=("train", "table", "shipped"))
     parser.add_argument("folder", type=Path)
     parser.add_argument("water", type=Path)
-    parser.add_argument("obc2", type=Path)
+    parser.add_argument("obc2", type=Path, nargs="?")
+    parser.add_argument("--earlier")
     parser.add_argument("--start", default=SHIPPED)
     parser.add_argument("--methods", nargs="+", choices=TRAINED, default=list(TRAINED))
     parser.add_argument("--runs", type=int, nargs="+", default=(1, 4, 16))
@@ -244,7 +278,12 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--workers", type=int, default=available_cores())
     parser.add_argument("-o", "--out", type=Path, default=TABLES / "peptides_water.json")
     a = parser.parse_args(arguments)
+    if a.obc2 is None and a.what != "shipped":
+        parser.error("name the folder of OBC2, too.")
     a.folder.mkdir(parents=True, exist_ok=True)
+    if a.what == "shipped":
+        shipped_table(a.folder, a.water, a.earlier, a.out.with_stem(f"{a.out.stem}_shipped"))
+        return
     if a.what == "table":
         make_table(a.folder, a.water, a.obc2, a.start, a.out)
         return
