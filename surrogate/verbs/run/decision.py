@@ -145,12 +145,14 @@ def _shares(rates: Rates, way: Way, budget_s: float, left_s: float) -> dict[Stag
 
 def least_budget_s(rates: Rates) -> float:
     """Return the wall seconds in which a run comes to anything; a machine that is busy now may not be in a while. In
-    explicit water MD, which has half of them, begins late and is slow."""
-    md_s = rates.begins_s
+    explicit water MD, which has half of them beside a rollout, begins late and is slow."""
+    found_s = LEAST_BUDGET_S * min(rates.stretch, 2.0)
     if rates.explicit:
-        base_ps = _base_ps(rates, "md" if rates.rolls is None else "rollout")
-        md_s += _LEAST_MD_FRAMES * base_ps * rates.replicas / rates.md_ps_per_s
-    return LEAST_BUDGET_S * min(rates.stretch, 2.0) + 2.0 * md_s
+        alone = rates.rolls is None
+        frames_ps = _LEAST_MD_FRAMES * _base_ps(rates, "md" if alone else "rollout")
+        md_s = rates.begins_s + frames_ps * rates.replicas / rates.md_ps_per_s
+        found_s += md_s / ((1.0 - _REPORT_SHARE) if alone else 0.5)
+    return found_s
 
 
 def _report_s(rates: Rates) -> tuple[float, float]:

@@ -38,7 +38,7 @@ _CHUNKS = 6
 UNSEEN_PS = 1000.0
 _LONGEST_STRETCH = 30.0
 # Steps of OpenMM that minimising the energy of a cell of water costs, and ps of a replica that it takes to begin.
-_MINIMISED_STEPS, _BEGINS_PS = 500, 16.0
+_MINIMISED_STEPS, _BEGINS_PS = 2500, 16.0
 # Beyond this SIMD replicas are not tried: all compute the same pairs of waters, the more in vain the larger the cell.
 _MOST_ATOMS_BY_SIMD = 3000
 

@@ -195,10 +195,10 @@ def test_a_budget_in_explicit_water_is_enough_for_md_to_begin() -> None:
                   rolls=Rolls("peptides", 10.0, 30_000.0, 8, 480.0, 130.0))  # fmt: skip
     wet = replace(dry, explicit=True)
     assert decide(dry, 60.0).seconds("held-out md") > 0.0 and dry.begins_s == 0.0
-    assert wet.begins_s == pytest.approx(1.6 + 16 * 16.0 / 16.4)
-    with pytest.raises(InputError, match=r"a budget of 60 s is too short: .* takes 2\.21 min .* Use `budget_s='140s'`"):
+    assert wet.begins_s == pytest.approx(8.0 + 16 * 16.0 / 16.4)
+    with pytest.raises(InputError, match=r"a budget of 60 s is too short: .* takes 2\.42 min .* Use `budget_s='150s'`"):
         decide(wet, 60.0)
-    md_s = decide(wet, 140.0).seconds("held-out md")
+    md_s = decide(wet, 150.0).seconds("held-out md")
     assert md_s > wet.begins_s + 4 * 10.0 * 16 / 16.4, "four frames of each replica, if MD has half of the time"
 
 
