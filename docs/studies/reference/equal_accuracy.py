@@ -6,7 +6,8 @@ FOLDER is that of `error_against_minutes`, with the molecule's reference, runs a
 square error of the populations of all torsion states is that beside the reference, less the reference's own. MD of all
 states that is T long errs by sqrt(c / T), where c follows from how far the reference's replicas scatter; so an error
 is equivalent to a length of such MD. Over the length that OpenMM, and SIMD replicas, make in these minutes it is the
-speed-up. OpenMM's answer is that of one SIMD replica from one start, as far as these reach, root mean square over
+speed-up. A torsion of which the reference enters some state fewer than ten times plays no part: it does not know how
+likely that is. OpenMM's answer is that of one SIMD replica from one start, as far as these reach, root mean square over
 sixteen. Intervals (95 %) are of the reference's replicas, drawn again.
 """
 
@@ -36,11 +37,18 @@ from error_against_minutes import (
 )
 
 from md_reference.run.machine import machine_name
-from surrogate.comparison.measure.torsions import find_wells
+from surrogate.comparison.measure.torsions import Wells, find_wells
 from surrogate.comparison.read.ensemble import Ensemble
 from surrogate.verbs.run.run_record import RunResult
 
-DRAWS, SEED = 2_000, 0
+DRAWS, SEED, LEAST_ENTRIES = 2_000, 0, 10
+
+
+def known(wells: Wells, segments: Sequence[FloatArray]) -> bool:
+    """Return whether replicas enter every state of a torsion, of several, often enough."""
+    states = wells.assign(segments)
+    entries = [sum(int(((x[1:] == k) & (x[:-1] != k)).sum()) for x in states) for k in range(len(wells.names))]
+    return len(entries) > 1 and min(entries) >= LEAST_ENTRIES
 
 
 class Populations:
@@ -48,7 +56,7 @@ class Populations:
 
     def __init__(self, ref: LongMD) -> None:
         self.ref = ref
-        self.wells = {name: wells for name, x in ref.angles.items() if len((wells := find_wells(x)).names) > 1}
+        self.wells = {name: wells for name, x in ref.angles.items() if known(wells := find_wells(x), x)}
         self.of_replicas = np.stack(
             [self.of({k: [x[r]] for k, x in ref.angles.items()}) for r in range(len(ref.files))]
         )
@@ -87,7 +95,8 @@ def lines(place: Path, minutes: float, ref: LongMD) -> list[list[str]]:
     rates, _ = rates_of(place, minutes)
     result = RunResult.of(place / f"{minutes:g}min")
     populations, seconds = Populations(ref), 60.0 * minutes
-    openmm_ps, simd_ps = (seconds * float(rates[key]) for key in ("openmm_ps_per_s", "md_ps_per_s"))
+    openmm_ps = seconds * rates["cores"] * rates["timestep_ps"] / rates["step_s"] / rates["stretch"]
+    simd_ps = seconds * rates["md_ps_per_s"]
     one = ref.load(finished(place / "one"), max(openmm_ps, md_length_ps(rates, minutes)))
     each = one_by_one(measured(ref.baseline, one))
     answer = answer_again(result, ref)
