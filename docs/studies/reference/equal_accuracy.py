@@ -57,9 +57,7 @@ class Populations:
     def __init__(self, ref: LongMD) -> None:
         self.ref = ref
         self.wells = {name: wells for name, x in ref.angles.items() if known(wells := find_wells(x), x)}
-        self.of_replicas = np.stack(
-            [self.of({k: [x[r]] for k, x in ref.angles.items()}) for r in range(len(ref.files))]
-        )
+        self.of_replicas = np.stack([self.of(angles) for angles in one_by_one(ref.angles)])
         self.total_ps = ref.ensemble.lag_ps * sum(map(len, ref.ensemble.segments))
 
     def of(self, angles: Angles, weights: Sequence[FloatArray] | None = None) -> FloatArray:
@@ -150,7 +148,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     rows = lines(place, given.minutes, ref)
     note = (
         f"{given.molecule}, {given.minutes:g} minutes of one core. Reference: {len(ref.files)} SIMD replicas from many "
-        f"starts, {length_ps(ref.ensemble) * 1e-3:.0f} ns in all, split R-hat {ref.r_hat:.2f}; its halves of a replica "
+        f"starts, {length_ps(ref.ensemble) * 1e-3:.0f} ns in all, split R-hat {ref.r_hat:.2f}; its halves "
         f"differ by {ref.replicate_baseline:.3f} in torsions (Jensen-Shannon distance, root, natural logarithm)."
     )
     table: dict[str, Any] = {

@@ -120,7 +120,7 @@ def set_pace(model: PeptideSlide, subjects: Sequence[PeptideSubject]) -> None:
         some = [s for s in subjects if s.chain.solvent == solvent]
         for _ in range(_CHANGES_PASSES if some else 0):
             found = [change for subject in some for change in changes(model, subject) if change.torsion == _PSI]
-            beside = torch.tensor([[kind not in ends for kind in change.types[1:]] for change in found]).double()
+            beside = torch.tensor([[kind not in ends for kind in c.types[1:]] for c in found]).double().reshape(-1, 2)
             factors = _nearest(beside, found, [change.slow for change in found])
             levels = jumps.of_change.new_zeros(3, jumps.of_change.shape[1])
             levels[1:] = factors[:, None]
