@@ -62,11 +62,19 @@ def print_json(value: Any) -> None:
     _say(json.dumps(value, indent=2, default=str))
 
 
+# Of more numbers than that by name, and of more files, a few are shown.
+_MOST, _MOST_FILES, _FEW = 18, 6, 3
+
+
 def print_pairs(record: Any, indent: int = 0, *, as_json: bool = False) -> None:
-    """Print a record as aligned lines, nested records indented, lists of plain values joined; or as JSON."""
+    """Print a record as aligned lines, nested records indented, lists of plain values joined, of long ones the first
+    entries; or as JSON, all of it."""
     if as_json:
         return print_json(record)
     shown = {k: v for k, v in record.items() if v is not None and v != () and v != []}
+    numbers = len(shown) > _MOST and all(isinstance(v, (int, float)) for v in shown.values())
+    more = len(shown) - _FEW if numbers else 0
+    shown = dict(list(shown.items())[: len(shown) - more])
     width = max((len(k) for k in shown), default=0)
     for key, value in shown.items():
         margin = " " * indent
@@ -75,11 +83,19 @@ def print_pairs(record: Any, indent: int = 0, *, as_json: bool = False) -> None:
             print_pairs(value, indent + 2)
         elif isinstance(value, (list, tuple)) and any(isinstance(v, dict) or " " in str(v) for v in value):
             _say(f"{margin}{key}")
-            for entry in value:
+            files = len(value) > _MOST_FILES and all(isinstance(v, dict) and "what" not in v for v in value)
+            for entry in value[:_FEW] if files else value:
                 _say(f"{margin}  {_one_line(entry)}")
+            _say_more(len(value) - _FEW if files else 0, indent + 2)
         else:
             text = ", ".join(map(_plain, value)) if isinstance(value, (list, tuple)) else _plain(value)
             _say(f"{margin}{key:<{width}}  {text}")
+    _say_more(more, indent)
+
+
+def _say_more(n: int, indent: int) -> None:
+    if n:
+        _say(f"{' ' * indent}and {n} more (--json has all)")
 
 
 def _one_line(entry: Any) -> str:

@@ -50,3 +50,16 @@ def test_a_folder_of_many_runs_lists_them(tmp_path: Path) -> None:
 def test_the_record_of_a_forced_rollout_is_printed(capsys: pytest.CaptureFixture[str]) -> None:
     print_pairs({"out_of_domain": [{"what": "temperature", "reason": "350 K, trained at 300 K"}]})
     assert "temperature: 350 K, trained at 300 K" in capsys.readouterr().out
+
+
+def test_of_many_files_and_numbers_a_few_are_printed_and_json_has_all(capsys: pytest.CaptureFixture[str]) -> None:
+    few = {"kt": {f"r{k}": 0.5 * k for k in range(5)}, "sources": [{"file": f"f{k}"} for k in range(5)]}
+    print_pairs(few)
+    assert len(capsys.readouterr().out.splitlines()) == 2 + 5 + 5
+    many = {"kt": {f"r{k}": 0.5 * k for k in range(50)}, "sources": [{"file": f"f{k}"} for k in range(50)],
+            "molecules": {f"m{k}": "Close." for k in range(50)}}  # fmt: skip
+    print_pairs(many)
+    lines = capsys.readouterr().out.splitlines()
+    assert lines.count("  and 47 more (--json has all)") == 2 and len(lines) == 3 + 2 * (3 + 1) + 50
+    print_pairs(many, as_json=True)
+    assert json.loads(capsys.readouterr().out) == many
