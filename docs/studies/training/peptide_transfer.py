@@ -93,6 +93,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--half", action="store_true")
     parser.add_argument("--pace", action="store_true")
     a = parser.parse_args(arguments)
+    if a.pace and a.start is None:
+        parser.error("--pace goes on from weights: name them by --start.")
     if is_trained(a.out):
         return
     sets = sets_of(a.train, a.runs)
@@ -106,8 +108,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     sys.stdout.write(f"{len(sets)} sets of runs, {total_us:.3g} µs; left out: {', '.join(left) or 'none'}\n")
     start = None if a.start is None else load_weights(weights_path(a.start))
     energies = known_energies(a.out.parent) or trained_with(None if start is None else start.provenance)
-    if a.pace:
-        assert start is not None
+    if a.pace and start is not None:
         with_pace(sets, start, energies, a.out)
         return
     training = PeptideTraining(
