@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from md_reference.forces.spec import QUANTUM, ForceFieldSpec
+from md_reference.forces.umbrella import Umbrella
 from systems.errors import InputError, UnknownNameError, nearest
 from systems.files.outside import check_disk
 from systems.options import option
@@ -41,7 +42,8 @@ class Conditions:
 
 @dataclass(frozen=True, kw_only=True)
 class MDConfig(Conditions):
-    """One run under these conditions. Times in ps; 'nve' starts from an equilibration in NVT."""
+    """One run under these conditions. Times in ps; 'nve' starts from an equilibration in NVT. Under an `umbrella`
+    frames have its energy beside them, in a column of their trajectory, and are not those of equilibrium."""
 
     time_ps: float = option("Simulated time, such as 10ns.")
     save_every_ps: float = option("Interval between saved frames.", 1.0)
@@ -56,6 +58,7 @@ class MDConfig(Conditions):
     keep: str = option("Atoms to save in explicit water: solute, all or auto (all; solute on platform simd).", "auto")
     save_velocities: bool = option("Save velocities (.h5 only).", False)
     save_forces: bool = option("Save forces (.h5 only).", False)
+    umbrella: Umbrella | None = None
 
     @property
     def steps_per_frame(self) -> int:

@@ -23,7 +23,16 @@ from md_reference.run.config import SIMD, MDConfig, check_run
 from md_reference.run.engine import Engine, refuse_damaged
 from md_reference.run.machine import available_cores, platform_for, simd_choice
 from md_reference.run.plan import plan_line
-from md_reference.run.simulate import ProgressFn, StoredRun, already_complete, record_of, report_preparing, simulate
+from md_reference.run.simulate import (
+    ProgressFn,
+    StoredRun,
+    already_complete,
+    own_scalars,
+    record_of,
+    report_preparing,
+    simulate,
+    system_of,
+)
 from md_reference.run.starts import many_starts
 from md_reference.simd.force_field import CENTRED_STEPS, SimdReplicas, n_replicas
 from md_reference.simd.system_terms import read_terms
@@ -85,7 +94,7 @@ class _Batch(StoredRun):
 
     def start(self, starts_nm: npt.NDArray[np.floating] | None) -> None:
         """Go to where the batch was left, or to the starts, and equilibrate. Raises SimulationError."""
-        config, system = self.config, build_system(self.scene, self.config.force)
+        config, system = self.config, system_of(self.scene, self.config)
         bath: dict[str, Any] = {"temperature_k": config.temperature_k, "friction_per_ps": config.friction_per_ps}
         self.simd = SimdReplicas(system, **bath, timestep_ps=config.timestep_ps, seed=config.seed)
         self.n_dof = self.simd.n_dof
@@ -117,8 +126,8 @@ class _Batch(StoredRun):
     def save(self) -> None:
         self.keep(self.blob, platform=SIMD)
 
-    def frame(self) -> tuple[npt.NDArray[np.float32], FloatArray, FloatArray] | None:
-        """Return positions, energies and temperatures of all replicas."""
+    def frame(self) -> tuple[npt.NDArray[np.float32], dict[str, FloatArray]] | None:
+        """Return positions and scalars of all replicas."""
         per_frame = self.config.steps_per_frame
         # As many at once as `SimdReplicas.step` would take of a frame's.
         for done in range(0, per_frame, CENTRED_STEPS):
@@ -126,15 +135,16 @@ class _Batch(StoredRun):
                 return None
             self.simd.step(min(CENTRED_STEPS, per_frame - done))
         self.blob = self.simd.checkpoint()
-        positions = self.simd.positions_nm[:, self.atoms].astype(np.float32)
-        return positions, self.simd.energies(), self.simd.temperatures_k()
+        positions = self.simd.positions_nm
+        scalars = {"potential_kj_mol": self.simd.energies(), "temperature_k": self.simd.temperatures_k()}
+        return positions[:, self.atoms].astype(np.float32), own_scalars(self.config, scalars, positions)
 
     def append(self, writers: Sequence[TrajectoryWriter], frames: Sequence[Any], times_ps: npt.ArrayLike) -> None:
-        positions, energies, temperatures = (np.stack(x, axis=1) for x in zip(*frames, strict=True))
+        positions = np.stack([positions for positions, _ in frames], axis=1)
         cell = self.scene.cell_nm
         cells = None if cell is None else np.repeat(cell[None], len(frames), axis=0)
         for k, writer in enumerate(writers):
-            scalars = {"potential_kj_mol": energies[k], "temperature_k": temperatures[k]}
+            scalars = {name: np.array([each[name][k] for _, each in frames]) for name in frames[0][1]}
             writer.append(positions[k], times_ps, scalars=scalars, cell_nm=cells)
 
 

@@ -35,7 +35,7 @@ from systems.trajectory.checkpoint import (
     write_checkpoint,
     writer_at,
 )
-from systems.trajectory.codec import open_trajectory
+from systems.trajectory.codec import DIFFERENCE_COLUMN, open_trajectory
 from systems.units import format_time_ps
 
 __all__ = ["MDConfig", "checkpoint_path", "simulate"]
@@ -245,7 +245,7 @@ class _Run(StoredRun):
 
     def start(self, choice: PlatformChoice | None) -> None:
         """Settle the platform, and go to where the run was left, or to time 0."""
-        self.system = build_system(self.scene, self.config.force)
+        self.system = system_of(self.scene, self.config)
         if self.resumed:
             choice = PlatformChoice(self.stand.platform, self.stand.threads, "as before it was resumed")
         self.choice = choice or platform_for(self.scene, self.config)
@@ -323,6 +323,7 @@ class _Run(StoredRun):
         cells = None if self.scene.cell_nm is None else np.array([s.cell_nm for s in frames])
         if cells is not None and self.config.ensemble == "npt":
             scalars["volume_nm3"] = np.linalg.det(cells)
+        scalars = own_scalars(self.config, scalars, np.array([s.positions_nm for s in frames]))
         writers[0].append(
             written("positions_nm").astype(np.float32),
             times_ps,
@@ -338,6 +339,23 @@ class _Run(StoredRun):
         if self.config.force.force_field != QUANTUM:
             return None
         return check_frames(positions_nm, geometry_from_scene(self.written)) & np.uint16(INVALID)
+
+
+def system_of(scene: Scene, config: MDConfig) -> Any:
+    """Return the `openmm.System` of a run, the umbrella potential included."""
+    system = build_system(scene, config.force)
+    if config.umbrella is not None:
+        system.addForce(config.umbrella.force())
+    return system
+
+
+def own_scalars(config: MDConfig, scalars: dict[str, FloatArray], positions_nm: FloatArray) -> dict[str, FloatArray]:
+    """Return the scalars of frames `(n, n_atoms, 3)`: their potential energy, without that of the umbrella, which is in
+    a column of its own."""
+    if config.umbrella is None:
+        return scalars
+    own = config.umbrella.energies_kj_mol(positions_nm)
+    return scalars | {"potential_kj_mol": scalars["potential_kj_mol"] - own, DIFFERENCE_COLUMN: -own}
 
 
 def record_of(scene: Scene, config: MDConfig, choice: PlatformChoice) -> dict[str, Any]:

@@ -199,6 +199,11 @@ def compare(
     options = options or Options()
     whole = reference.scene
     everyone = [reference, *candidates, *([] if replicate is None else [replicate])]
+    for ensemble in everyone:
+        if ensemble.differences_kj_mol is not None:
+            raise InputError(
+                f"{ensemble.label} is MD under an umbrella potential: its frames do not count alike; compare other MD."
+            )
     thinned, kept = alike(everyone)
     # Torsions and rings are found in the whole molecule; only hydrogens or side chains may be missing.
     stage = whole if kept is None else thinned[0].scene

@@ -36,6 +36,7 @@ from systems.chemistry.geometry import column_blocks, torsion_angle
 from systems.chemistry.validity import INVALID
 from systems.errors import InputError
 from systems.scene import Scene
+from systems.trajectory.codec import frame_factors
 from systems.units import GAS_CONSTANT_KJ_MOL_K, format_time_ps
 
 _DIMENSIONS, _MICROSTATES, _FRAMES_A_MICROSTATE = 8, 100, 50
@@ -364,14 +365,17 @@ def md_answer(
     """Return what MD replicas say of equilibrium, and how a surrogate's populations compare with that.
 
     `md`: one segment a replica; `temperature_k` of its bath; `factors`: what each frame counts at the law of a
-    reference, exp(-(U_reference - U_model) / kT) up to a constant, NaN where the reference was not asked. Of a small
-    molecule that is its own mirror image each replica counts with its mirror image, where MD was on either side.
+    reference, exp(-(U_reference - U_model) / kT) up to a constant, NaN where the reference was not asked; MD under an
+    umbrella potential brings them. Of a small molecule that is its own mirror image each replica counts with its mirror
+    image, where MD was on either side.
     Raises InputError where no torsion of the molecule turns, so that MD has nothing to weigh, or replicas are too short
     to tell anything.
     """
     torsions = _Torsions(md)
     if not len(torsions.quads) and factors is None:
         raise InputError(f"{md.scene.name}: no torsion turns, and so there are no states to weigh.")
+    if factors is None and md.differences_kj_mol is not None:
+        factors = frame_factors(md.differences_kj_mol, temperature_k)
     of_md = torsions.of(md)
     hands = _hands(of_md, md.lag_ps) if torsions.has_images else None
     angles = of_md if hands is None else [np.where(h[:, None], -a, a) for a, h in zip(of_md, hands, strict=True)]

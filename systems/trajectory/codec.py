@@ -212,6 +212,15 @@ def reweighting(differences_kj_mol: npt.ArrayLike, temperature_k: float) -> tupl
     return weights, float(1.0 / np.square(weights).sum())
 
 
+def frame_factors(differences_kj_mol: Sequence[Float64Array], temperature_k: float) -> list[Float64Array]:
+    """Return what each frame of replicas counts at the reference's law (`reweighting`); NaN stays, and infinity counts
+    nothing."""
+    every = np.concatenate(list(differences_kj_mol))
+    factors, asked = np.full(len(every), np.nan), ~np.isnan(every)
+    factors[asked] = reweighting(every[asked], temperature_k)[0]
+    return np.split(factors, np.cumsum([len(d) for d in differences_kj_mol])[:-1])
+
+
 def frame_weights(path: str | Path) -> Float64Array:
     """Return the weights `(n_frames,)` of a trajectory's frames at equilibrium; ones where the file has none. All
     replicas of one answer share a scale, mean 1 over all their frames: concatenate them as the frames. Raises

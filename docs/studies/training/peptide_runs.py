@@ -136,7 +136,7 @@ def check(folder: Path) -> list[str]:
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    chosen = arguments_of(__doc__, "--summary", "say what is there and check it; simulate nothing", arguments)
+    chosen = arguments_of(__doc__, {"--summary": "say what is there and check it; simulate nothing"}, arguments)
     if chosen.summary:
         print(json.dumps({**summary(chosen.folder), "wrong": check(chosen.folder)}, indent=1))  # noqa: T201
         return

@@ -9,7 +9,7 @@ import multiprocessing
 import os
 import sys
 import time
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -25,15 +25,16 @@ from systems.units import parse_wall_s
 
 
 def arguments_of(
-    about: str | None, switch: str, help: str, given: Sequence[str] | None, solvents: Collection[str] = ()
+    about: str | None, switches: Mapping[str, str], given: Sequence[str] | None, solvents: Collection[str] = ()
 ) -> argparse.Namespace:  # fmt: skip
-    """Read the command line that these commands have in common, one switch of their own, and the solvent where there
-    is a choice, by default the first."""
+    """Read the command line that these commands have in common, switches of their own with a help text each, and the
+    solvent where there is a choice, by default the first."""
     parser = argparse.ArgumentParser(description=about, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folder", type=Path)
     parser.add_argument("--budget", default="3h", help="wall time after which no further run is begun")
     parser.add_argument("--workers", type=int, default=available_cores())
-    parser.add_argument(switch, action="store_true", help=help)
+    for switch, help in switches.items():
+        parser.add_argument(switch, action="store_true", help=help)
     if solvents:
         parser.add_argument("--solvent", choices=list(solvents), default=next(iter(solvents)))
     chosen = parser.parse_args(given)

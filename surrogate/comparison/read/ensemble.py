@@ -95,7 +95,8 @@ class Ensemble(InSegments):
     `flags` `(n,)` uint16 and `chunk_idx` `(n,)` int32 per segment, or None where the file does not say; `record`: what
     the writer said of itself (costs summed over files); `sources`: the files; `top`, `stated_lag_ps`: what the user
     said of them; `notes`: what was done on reading; `grids_nm`: what the coordinates of each segment are rounded to, 0
-    for nothing (none given: nothing).
+    for nothing (none given: nothing); `differences_kj_mol`: of MD under an umbrella potential, how much lower each
+    frame lies without it.
     Raises InputError for shapes that do not fit, no frame at all, or a lag that is not positive.
     """
 
@@ -112,6 +113,7 @@ class Ensemble(InSegments):
     notes: tuple[str, ...] = ()
     kept: IntArray | None = None
     grids_nm: tuple[float, ...] = ()
+    differences_kj_mol: Sequence[FloatArray] | None = None
 
     def __post_init__(self) -> None:
         if not (math.isfinite(self.lag_ps) and self.lag_ps > 0):
@@ -123,9 +125,13 @@ class Ensemble(InSegments):
                 )
         if self.n_frames == 0:
             raise InputError(f"{self.label}: no frames.")
-        for name, series in (("flags", self.flags), ("chunk_idx", self.chunk_idx)):
+        for name, series in self._columns.items():
             if series is not None and [len(s) for s in series] != self.segment_lengths:
                 raise InputError(f"{self.label}: {name} do not match the segments in length.")
+
+    @property
+    def _columns(self) -> dict[str, Sequence[npt.NDArray[Any]] | None]:
+        return {name: getattr(self, name) for name in ("flags", "chunk_idx", "differences_kj_mol")}
 
     @property
     def segment_lengths(self) -> list[int]:
@@ -148,8 +154,7 @@ class Ensemble(InSegments):
         if stride == 1:
             return self
         segments = [s.thinned(stride) if isinstance(s, StoredFrames) else s[::stride] for s in self.segments]
-        columns = {"flags": self.flags, "chunk_idx": self.chunk_idx}
-        thinned: dict[str, Any] = {k: [x[::stride] for x in series] for k, series in columns.items() if series}
+        thinned: dict[str, Any] = {k: [x[::stride] for x in series] for k, series in self._columns.items() if series}
         note = f"{self.label}: one frame in {stride} is used, for equal save intervals."
         return replace(self, segments=segments, lag_ps=self.lag_ps * stride, notes=(*self.notes, note), **thinned)
 
@@ -195,7 +200,7 @@ def load_ensemble(
         raise InputError("No trajectory file was given.")
     name = label or Path(paths[0]).name + (f" + {len(paths) - 1} more" if len(paths) > 1 else "")
     segments: list[Frames] = []
-    columns: dict[str, list[Any]] = {"flags": [], "chunk_idx": []}
+    columns: dict[str, list[Any]] = {"flags": [], "chunk_idx": [], "differences_kj_mol": []}
     records: list[dict[str, Any]] = []
     scalars: list[Mapping[str, FloatArray]] = []
     lags: list[float] = []
@@ -219,7 +224,8 @@ def load_ensemble(
             reader.close()
         else:
             segments += frames.split(cuts)
-        for key, values, kind in (("flags", reader.flags, np.uint16), ("chunk_idx", reader.chunk_idx, np.int32)):
+        for key, values, kind in (("flags", reader.flags, np.uint16), ("chunk_idx", reader.chunk_idx, np.int32),
+                                  ("differences_kj_mol", _of_umbrella(reader), np.float64)):  # fmt: skip
             columns[key] += [] if values is None else np.split(np.asarray(values, dtype=kind), cuts)
         if len(replicas) > 1:
             notes.append(f"{path}: {len(replicas)} replicas in one file, which are compared as separate runs.")
@@ -252,6 +258,11 @@ def load_ensemble(
         grids_nm=tuple(grids),
         **known,
     )
+
+
+def _of_umbrella(reader: TrajectoryReader) -> FloatArray | None:
+    """Return how much lower frames `(n,)` of MD under an umbrella potential lie without it; else None."""
+    return reader.scalars.get(DIFFERENCE_COLUMN) if reader.record.get("umbrella") else None
 
 
 def _together(notes: Sequence[str], paths: Sequence[str | Path]) -> tuple[str, ...]:

@@ -23,7 +23,6 @@ from systems.files.outside import content
 from systems.files.whole_file import create_whole
 from systems.interrupts import stop_if_asked
 from systems.scene import Scene
-from systems.trajectory.codec import reweighting
 
 _COLUMNS = "replica,frame,difference_kj_mol"
 # Frames that a core computes before the clock is looked at again.
@@ -86,11 +85,3 @@ def differences(folder: Path, lengths: list[int]) -> list[FloatArray]:
     except (OSError, ValueError) as error:
         raise InputError(f"{path} cannot be read ({error}); remove it, and `resume=True` asks anew.") from error
     return found
-
-
-def factors_of(differences_kj_mol: list[FloatArray], temperature_k: float) -> list[FloatArray]:
-    """Return what each frame counts at the reference's law (`reweighting`); NaN stays, and infinity counts nothing."""
-    every = np.concatenate(differences_kj_mol)
-    factors, asked = np.full(len(every), np.nan), ~np.isnan(every)
-    factors[asked] = reweighting(every[asked], temperature_k)[0]
-    return np.split(factors, np.cumsum([len(d) for d in differences_kj_mol])[:-1])

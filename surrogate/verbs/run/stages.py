@@ -35,7 +35,7 @@ from systems.files.whole_file import create_whole, replica_paths
 from systems.options import Preparation
 from systems.scene import Scene
 from systems.trajectory.checkpoint import checkpoint_path, frames_in
-from systems.trajectory.codec import write_weights
+from systems.trajectory.codec import frame_factors, write_weights
 from systems.units import format_time_ps, format_wall
 
 if TYPE_CHECKING:
@@ -452,7 +452,7 @@ def answer_of(site: Site, record: RunRecord) -> Answer | None:
 
 def _reweighted(site: Site, rolled: Ensemble) -> Answer | None:
     """Return what a rollout says at the law of its reference; None where that was not asked, or it is too short."""
-    from surrogate.verbs.run.single_points import differences, factors_of
+    from surrogate.verbs.run.single_points import differences
 
     known = differences(site.folder, rolled.segment_lengths)
     if not any(np.isfinite(d).any() for d in known):
@@ -460,7 +460,7 @@ def _reweighted(site: Site, rolled: Ensemble) -> Answer | None:
     temperature_k = site.config.temperature_k
     with suppress(InputError):
         return md_answer(
-            rolled, temperature_k, surrogate=rolled, factors=factors_of(known, temperature_k), seed=site.options.seed
+            rolled, temperature_k, surrogate=rolled, factors=frame_factors(known, temperature_k), seed=site.options.seed
         )
     return None
 

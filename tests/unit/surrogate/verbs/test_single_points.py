@@ -17,12 +17,13 @@ from surrogate.models.propagator import Molecule
 from surrogate.models.weights import Weights, load_weights
 from surrogate.verbs.run import single_points
 from surrogate.verbs.run.run_record import ENERGIES_NAME
-from surrogate.verbs.run.single_points import ask_reference, differences, factors_of
+from surrogate.verbs.run.single_points import ask_reference, differences
 from systems.chemistry.validity import CHIRALITY
 from systems.errors import InputError
 from systems.interrupts import stop_when
 from systems.library.named_scenes import prepare
 from systems.scene import Scene
+from systems.trajectory.codec import frame_factors
 
 pytest.importorskip("tblite")
 
@@ -58,7 +59,7 @@ def test_every_valid_frame_has_the_reference_s_energy_less_the_potential_s(
     found = differences(tmp_path, frames.segment_lengths)
     assert found[0] == pytest.approx(right, abs=1e-4)
     assert np.isnan(found[1]).tolist() == [k == 3 for k in range(6)], "an invalid frame is not asked for"
-    factors = factors_of(found, 300.0)
+    factors = frame_factors(found, 300.0)
     energies = -0.0083144626 * 300.0 * np.log(factors[0])
     assert energies - energies[0] == pytest.approx(found[0] - found[0][0], abs=1e-6)
     assert np.nansum(np.concatenate(factors)) == pytest.approx(1.0)
@@ -103,6 +104,6 @@ def test_a_damaged_file_is_refused_in_a_line(tmp_path: Path) -> None:
 
 
 def test_a_frame_of_another_molecule_weighs_nothing() -> None:
-    factors = factors_of([np.array([1.0, np.inf, np.nan]), np.array([3.494, np.nan, np.nan])], 300.0)
+    factors = frame_factors([np.array([1.0, np.inf, np.nan]), np.array([3.494, np.nan, np.nan])], 300.0)
     assert factors[0][1] == 0.0 and np.isnan(factors[0][2]) and np.isnan(factors[1][1:]).all()
     assert factors[1][0] / factors[0][0] == pytest.approx(np.exp(-1.0), abs=1e-3)
