@@ -2,14 +2,16 @@
 
     python docs/studies/training/peptide_transfer.py OUT.safetensors --train FOLDER [FOLDER ...] --budget 1h
                [--start WEIGHTS] [--tuned all|flow|states] [--coupled] [--runs 16] [--steps N] [--unseen 12] [--half]
-    python docs/studies/training/peptide_transfer.py OUT.safetensors --train FOLDER [FOLDER ...] --start WEIGHTS --pace
+    python docs/studies/training/peptide_transfer.py OUT.safetensors --train FOLDER [FOLDER ...] --start WEIGHTS
+               --tuned pace|populations
 
 FOLDER: `train` in a folder of `peptide_campaign` or `peptide_runs`, of each molecule in it the first `--runs`. `flow`
 and `states` train the flow or the probabilities of torsion states alone, and need `--start`. `--unseen`: every so many
 molecules of several residues one is left out, and the curves show its loss. `--half` rounds to float16 at the end. Free
 energies of φ > 0 are those of `peptide_energies` beside OUT, or those that the weights gone on from were trained with.
-A training that was stopped goes on. `--pace` trains nothing: how often ψ changes its state beside other residues, in
-the solvent of the runs, is set to what they show, by one factor a side (`balance.set_pace`).
+A training that was stopped goes on. `pace` and `populations` train nothing: how often ψ changes its state beside other
+residues (`balance.set_pace`), or how likely states of ψ and side chains are (`balance.set_populations`, from runs under
+an umbrella potential), are set to what the runs show, in their solvent.
 """
 
 from __future__ import annotations
@@ -28,7 +30,7 @@ from processes import is_trained
 
 from surrogate.data import FrameSets, Split, TrainingFrames, collect_frames
 from surrogate.models.architecture import weights_path
-from surrogate.models.peptides.balance import set_pace
+from surrogate.models.peptides.balance import set_pace, set_populations
 from surrogate.models.peptides.layout import PeptideConfig, chain_features
 from surrogate.models.peptides.model import PeptideSlide
 from surrogate.models.peptides.subjects import PeptideSubject
@@ -40,10 +42,12 @@ from systems.units import parse_wall_s
 _VALIDATE_S = 300.0
 # The end of each run that is held out has at least so many frames, more than a chunk.
 _HELD_FRAMES = 20
+# What is set to what runs show, without training.
+LEVELS = {"pace": set_pace, "populations": set_populations}
 
 
-def sets_of(folders: Sequence[Path], runs: int = 10_000) -> list[TrainingFrames]:
-    """Return the frames of every molecule in folders, of so many runs at most. Raises InputError for none, and for
+def sets_of(folders: Sequence[Path], runs: int = 10_000, *, umbrella: bool = False) -> list[TrainingFrames]:
+    """Return the frames of every molecule in folders, of so many runs at most, with or without an umbrella. Raises InputError for none, and for
     residues that weights are tested on, whatever their ends."""
     tested = {"-".join(p.residues) for p in (*unseen_peptides(), *held_out_peptides()) if len(p.residues) > 1}
     found = []
@@ -51,7 +55,7 @@ def sets_of(folders: Sequence[Path], runs: int = 10_000) -> list[TrainingFrames]
         if place.name.removeprefix("free-") in tested:
             raise InputError(f"{place}: weights are tested on these residues; leave it out of training.")
         if files := sorted(place.glob("run_*.h5"))[:runs]:
-            frames = collect_frames(files)
+            frames = collect_frames(files, umbrella=umbrella)
             share = max(Split.share, _HELD_FRAMES / int(np.diff(frames.starts).min()))
             found.append(replace(frames, split=Split(share)))
     if not found:
@@ -68,14 +72,16 @@ def trained_with(provenance: dict[str, Any] | None) -> dict[str, float]:
     return {}
 
 
-def with_pace(sets: Sequence[TrainingFrames], start: Weights, energies: dict[str, float], out: Path) -> None:
-    """Write weights with the pace of psi that frames show."""
+def with_levels(
+    sets: Sequence[TrainingFrames], start: Weights, energies: dict[str, float], out: Path, set: str
+) -> None:
+    """Write weights with the pace or the populations that frames show."""
     model = cast(PeptideSlide, start.model)
     chains = [chain_features(f.scene, model.config, f.conditions.get("solvent")) for f in sets]
     subjects = [PeptideSubject(f, chain).in_equilibrium(energies) for f, chain in zip(sets, chains, strict=True)]
-    set_pace(model, subjects)
+    LEVELS[what](model, subjects)
     domain = peptides_domain(sets, model.config, start.domain)
-    provenance = provenance_of(FrameSets(tuple(sets)).origin, {"tuned": "pace"}, start)
+    provenance = provenance_of(FrameSets(tuple(sets)).origin, {"tuned": what}, start)
     save_weights(out, model, domain, provenance, half=True)
 
 
@@ -84,20 +90,19 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("out", type=Path)
     parser.add_argument("--train", type=Path, nargs="+", required=True)
     parser.add_argument("--start")
-    parser.add_argument("--tuned", choices=TUNED, default="all")
+    parser.add_argument("--tuned", choices=(*TUNED, *LEVELS), default="all")
     parser.add_argument("--coupled", action="store_true")
     parser.add_argument("--runs", type=int, default=10_000)
     parser.add_argument("--unseen", type=int, default=0)
     parser.add_argument("--budget", type=lambda text: parse_wall_s(text, "--budget"))
     parser.add_argument("--steps", type=int)
     parser.add_argument("--half", action="store_true")
-    parser.add_argument("--pace", action="store_true")
     a = parser.parse_args(arguments)
-    if a.pace and a.start is None:
-        parser.error("--pace goes on from weights: name them by --start.")
+    if a.tuned in LEVELS and a.start is None:
+        parser.error(f"--tuned {a.tuned} goes on from weights: name them by --start.")
     if is_trained(a.out):
         return
-    sets = sets_of(a.train, a.runs)
+    sets = sets_of(a.train, a.runs, umbrella=a.tuned == "populations")
     names = {id(frames): "-".join(frames.scene.residue_names) for frames in sets}
     alone = {f"ACE-{residue}-NME" for residue in RESIDUES}
     chains = sorted({*names.values()} - alone)
@@ -108,8 +113,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     sys.stdout.write(f"{len(sets)} sets of runs, {total_us:.3g} µs; left out: {', '.join(left) or 'none'}\n")
     start = None if a.start is None else load_weights(weights_path(a.start))
     energies = known_energies(a.out.parent) or trained_with(None if start is None else start.provenance)
-    if a.pace and start is not None:
-        with_pace(sets, start, energies, a.out)
+    if a.tuned in LEVELS and start is not None:
+        with_levels(sets, start, energies, a.out, a.tuned)
         return
     training = PeptideTraining(
         budget_s=a.budget, steps=a.steps, time_reversal=True, positive_phi_kt=energies, tuned=a.tuned,

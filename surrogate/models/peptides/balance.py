@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from itertools import combinations
+from itertools import combinations, pairwise
 from typing import NamedTuple, cast
 
 import torch
@@ -58,15 +58,16 @@ class Phi(NamedTuple):
 
 class Change(NamedTuple):
     """Two states of one torsion of a residue: the `types` of the residue and of those beside it, which `torsion`, both
-    states, the logarithm of how many more frames go back from the second than to it, and how many changes of either
-    direction are `expected` and `seen` in as many windows as the runs hold end to end."""
+    states, the logarithm of how many more frames go back from the second than to it, and how far, squared, it errs; and
+    how many changes of either direction are `expected` and `seen` in as many windows as the runs hold end to end."""
 
     types: tuple[int, int, int]
     torsion: int
     states: tuple[int, int]
     lacking: float
-    expected: float
-    seen: float
+    variance: float
+    expected: float = 0.0
+    seen: float = 0.0
 
     @property
     def slow(self) -> float:
@@ -75,8 +76,8 @@ class Change(NamedTuple):
 
     @property
     def counted(self) -> float:
-        """The inverse of how far, squared, `lacking` and `slow` err: by few changes, and since molecules differ."""
-        return 1.0 / (2.0 / (self.seen + self.expected + 1.0) + _MOLECULES_DIFFER)
+        """The inverse of how far, squared, `lacking` and `slow` err, and since molecules differ."""
+        return 1.0 / (self.variance + _MOLECULES_DIFFER)
 
 
 @torch.no_grad()
@@ -129,6 +130,51 @@ def set_pace(model: PeptideSlide, subjects: Sequence[PeptideSubject]) -> None:
                 jumps.raise_change(_PSI, a, b, levels)
 
 
+@torch.no_grad()
+def set_populations(model: PeptideSlide, subjects: Sequence[PeptideSubject]) -> None:
+    """Move changes of psi and side chains, one direction against the other, to the populations of states that frames of
+    `subjects` have, which do not run in time as molecules do: first by what residues beside others lack alike, on
+    either side, then by what each type lacks beyond. Residues between caps keep their mean, and all keep their pace."""
+    ends = _ends(model)
+    for solvent, jumps in enumerate(cast(list[StateJumps], list(model.all_jumps))):
+        some = [s for s in subjects if s.chain.solvent == solvent and s.weights is not None]
+        for _ in range(_CHANGES_PASSES if some else 0):
+            found: dict[tuple[int, int, int], list[Change]] = {}
+            for change in (change for subject in some for change in lacking_populations(model, subject)):
+                found.setdefault((change.torsion, *change.states), []).append(change)
+            for (torsion, a, b), each in found.items():
+                has = F.one_hot(torch.tensor([c.types[0] for c in each]), jumps.of_change.shape[1]).double()
+                beside = torch.tensor([[kind not in ends for kind in c.types[1:]] for c in each]).double()
+                left = [max(-_MOST, min(c.lacking, _MOST)) for c in each]
+                common = _nearest(beside, each, left)
+                own = _nearest(has, each, (torch.tensor(left).double() - beside @ common.double()).tolist())
+                levels = torch.cat([own[None], common[:, None].expand(-1, len(own))])
+                levels[1:, ends] = 0.0
+                jumps.raise_change(torsion, a, b, levels.to(jumps.of_change.device) / 2)
+                jumps.raise_change(torsion, b, a, -levels.to(jumps.of_change.device) / 2)
+
+
+@torch.no_grad()
+def lacking_populations(model: PeptideSlide, subject: PeptideSubject) -> list[Change]:
+    """Return every two states of a peptide's torsions, but the signs of phi, that enough of its frames are in, drawn by
+    their weights; how far what is lacking errs is told by its runs, left out one after the other."""
+    assert subject.weights is not None
+    generator = torch.Generator().manual_seed(_SIDE_SEED)
+    idx = torch.multinomial(torch.from_numpy(subject.weights), _FRAMES, True, generator=generator)
+    flux, _, held = _fluxes(model, subject, idx, generator)
+    every = subject.states(torch.arange(subject.frames.n_frames))
+    weights, starts = torch.from_numpy(subject.weights), subject.frames.starts.tolist()
+    is_now = F.one_hot(every, chains.MOST_STATES) * weights[:, None, None, None]
+    of_runs = torch.stack([is_now[a:b].sum(0) for a, b in pairwise(starts)])
+    rest = (of_runs.sum(0) - of_runs).clamp(min=1e-9).log()
+    n, types = len(rest), subject.chain.places[:, :3].tolist()
+    return [
+        Change((*types[r],), k, (a, b), float(flux[r, k, b, a] - flux[r, k, a, b]),
+               float((n - 1) * (rest[:, r, k, a] - rest[:, r, k, b]).var(correction=0)))
+        for r, k, a, b in _pairs_of_states(subject, held)
+    ]  # fmt: skip
+
+
 def _levels(jumps: StateJumps, types: Sequence[Sequence[int]], lacking: Sequence[float], ridge: float) -> Tensor:
     """Return levels `(3, n_types)` of residues, of those before and of those after, whose sums come nearest to what is
     `lacking` where residues have these `types` (n, 3)."""
@@ -167,34 +213,56 @@ def changes(model: PeptideSlide, subject: PeptideSubject) -> list[Change]:
     none where no run is long enough."""
     if subject.weights is None:
         return []
-    chain, counts = subject.chain, subject.chain.stated.counts
     generator = torch.Generator().manual_seed(_SIDE_SEED)
-    step = max(1, round(_STEP_PS / subject.frames.lag_ps))
-    idx, ends_to_end = subject.in_turn(_FRAMES, step * _STEPS[-1], generator)
+    idx, ends_to_end = subject.in_turn(_FRAMES, _step(subject) * _STEPS[-1], generator)
     if not len(idx):
         return []
+    flux, shares, held = _fluxes(model, subject, idx, generator)
+    both = torch.zeros(2, *flux.shape)
+    for k, ours in zip(_STEPS, shares, strict=True):
+        then = F.one_hot(subject.states(idx + _step(subject) * k), chains.MOST_STATES).float()
+        is_now = F.one_hot(subject.states(idx), chains.MOST_STATES).float()
+        fluxes = torch.stack([torch.einsum("nrka,nrkb->rkab", is_now, later) for later in (ours, then)])
+        both += ends_to_end * _STEPS[-1] / k / _FRAMES / len(_STEPS) * (fluxes + fluxes.mT)
+    types, found = subject.chain.places[:, :3].tolist(), []
+    for r, k, a, b in _pairs_of_states(subject, held):
+        expected, seen = both[:, r, k, a, b].tolist()
+        lacking = float(flux[r, k, b, a] - flux[r, k, a, b])
+        found.append(Change((*types[r],), k, (a, b), lacking, 2.0 / (seen + expected + 1.0), expected, seen))
+    return found
+
+
+def _step(subject: PeptideSubject) -> int:
+    return max(1, round(_STEP_PS / subject.frames.lag_ps))
+
+
+def _pairs_of_states(subject: PeptideSubject, held: Tensor) -> list[tuple[int, int, int, int]]:
+    """Return residue, torsion and every two of its states that enough frames are in, but the signs of phi."""
+    counts = subject.chain.stated.counts
+    return [
+        (r, k, a, b)
+        for r, k in torch.nonzero(counts > 1).tolist() if k or r not in subject.chain.signed
+        for a, b in combinations(range(int(counts[r, k])), 2) if min(held[r, k, a], held[r, k, b]) >= _LEAST_FRAMES
+    ]  # fmt: skip
+
+
+def _fluxes(
+    model: PeptideSlide, subject: PeptideSubject, idx: Tensor, generator: torch.Generator
+) -> tuple[Tensor, list[Tensor], Tensor]:
+    """Return the logarithm of how many of the frames `idx` (n,) the model takes from each state of each torsion to each
+    other, in the mean over `_STEPS`; how likely each state is after each of these; how many frames are in each."""
+    chain, counts, step = subject.chain, subject.chain.stated.counts, _step(subject)
     observed, now = subject.seen(model, idx)
     ahead = step * torch.arange(1, _STEPS[-1] + 1)
-    times = (ahead * subject.frames.lag_ps).float().expand(_FRAMES, -1).to(observed.device)
-    uniform = torch.rand(_FRAMES, len(ahead), *counts.shape, generator=generator).to(observed.device)
+    times = (ahead * subject.frames.lag_ps).float().expand(len(idx), -1).to(observed.device)
+    uniform = torch.rand(len(idx), len(ahead), *counts.shape, generator=generator).to(observed.device)
     shares = torch.zeros(*uniform.shape, chains.MOST_STATES, device=observed.device)
     apart = times_apart(times, model.config.forgotten_ps)
     model.jumps_of(chain).draw(observed, now, chain.places, counts, times, apart, uniform, shares)
     is_now = F.one_hot(now.long(), chains.MOST_STATES).float().cpu()
-    logs, both = [], torch.zeros(2, *counts.shape, chains.MOST_STATES, chains.MOST_STATES)
-    for k in _STEPS:
-        is_then = F.one_hot(subject.states(idx + step * k), chains.MOST_STATES).float()
-        later = (shares[:, k - 1].cpu(), is_then)
-        fluxes = torch.stack([torch.einsum("nrka,nrkb->rkab", is_now, then) for then in later])
-        logs.append(fluxes[0].clamp(min=1e-6).log())
-        both += ends_to_end * _STEPS[-1] / k / _FRAMES / len(_STEPS) * (fluxes + fluxes.mT)
-    held = is_now.sum(0)
-    flux, types = torch.stack(logs).mean(0), chain.places[:, :3].tolist()
-    return [
-        Change((*types[r],), k, (a, b), float(flux[r, k, b, a] - flux[r, k, a, b]), *both[:, r, k, a, b].tolist())
-        for r, k in torch.nonzero(counts > 1).tolist() if k or r not in chain.signed
-        for a, b in combinations(range(int(counts[r, k])), 2) if min(held[r, k, a], held[r, k, b]) >= _LEAST_FRAMES
-    ]  # fmt: skip
+    then = [shares[:, k - 1].cpu() for k in _STEPS]
+    logs = [torch.einsum("nrka,nrkb->rkab", is_now, later).clamp(min=1e-6).log() for later in then]
+    return torch.stack(logs).mean(0), then, is_now.sum(0)
 
 
 def weighted_phis(model: PeptideSlide, subject: PeptideSubject) -> list[Phi]:

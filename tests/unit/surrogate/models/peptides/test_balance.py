@@ -10,7 +10,15 @@ import torch
 
 from small_scenes import with_phi_turned
 from surrogate.data import TrainingFrames, canonicalise, quantise
-from surrogate.models.peptides.balance import balance, changes, lacking_entries, set_pace, weighted_phis
+from surrogate.models.peptides.balance import (
+    balance,
+    changes,
+    lacking_entries,
+    lacking_populations,
+    set_pace,
+    set_populations,
+    weighted_phis,
+)
 from surrogate.models.peptides.layout import PeptideConfig, chain_features
 from surrogate.models.peptides.model import PeptideSlide
 from surrogate.models.peptides.subjects import PeptideSubject
@@ -19,6 +27,8 @@ from systems.prepare.peptide import build_peptide
 
 SHARE = 0.02
 EACH = 400
+# Frames of either side by turns.
+MIXED = np.arange(2 * EACH).reshape(2, EACH).T.ravel()
 
 
 def _frames(sequence: str, kind: str = "phi") -> TrainingFrames:
@@ -138,6 +148,60 @@ def test_the_pace_beside_other_residues_is_one_factor_a_side() -> None:
     of = {name: jumps.beside_change[:, 2 + config.types.index(name), 1] for name in config.types}
     assert of["ALA"].equal(of["SER"]) and not of["ACE"].any() and not of["NME"].any()
     assert of["ALA"][:, 0, 1].equal(of["ALA"][:, 1, 0]), "either direction alike"
+
+
+def test_populations_that_do_not_run_in_time_are_taken_over() -> None:
+    """Of psi, whose first side has 80 % of the weight; every run holds both sides alike."""
+    config = PeptideConfig(width=16, n_layers=1, n_heads=1, chunk_frames=4, solvents=("obc2", "tip3p"))
+    sets = [_frames(f"ACE-{name}-NME", kind="psi") for name in ("ALA-SER", "SER-ALA", "SER")]
+    sets = [replace(f, coordinates=f.coordinates[MIXED], starts=np.arange(9) * EACH // 4) for f in sets]
+    config = with_scale(config, sets)
+    subjects = [
+        PeptideSubject(f, chain_features(f.scene, config, "tip3p"), np.tile([0.8, 0.2], EACH) * 2.0) for f in sets
+    ]
+    torch.manual_seed(0)
+    model = PeptideSlide(config).requires_grad_(False)
+    model.jumps_elsewhere[0].of_change[0, :, 1].normal_()
+    jumps, start = model.jumps_elsewhere[0], {name: x.clone() for name, x in model.named_parameters()}
+
+    def lacking(some: list[PeptideSubject]) -> list[float]:
+        return [change.lacking for subject in some for change in lacking_populations(model, subject)]
+
+    before, alone = np.abs(lacking(subjects[:2])), lacking(subjects[2:])
+    shift = change_of(jumps, config, "ALA")
+    assert len(before) == 4 and before.mean() > 0.5
+    set_populations(model, subjects[:2])
+    assert np.abs(lacking(subjects[:2])).mean() < 0.35 * before.mean()
+    moved = {name for name, x in model.named_parameters() if not torch.equal(x, start[name])}
+    assert moved == {"jumps_elsewhere.0.of_change", "jumps_elsewhere.0.beside_change"}
+    assert change_of(jumps, config, "ALA") == pytest.approx(shift, abs=1e-5), "the pace stays"
+    caps = [2 + config.types.index(name) for name in ("ACE", "NME")]
+    assert not (jumps.beside_change[:, caps] - start["jumps_elsewhere.0.beside_change"][:, caps]).any()
+    own = abs(lacking(subjects[2:])[0] - alone[0])
+    assert own < before.mean(), "a residue between caps moves by what its type lacks beyond the others, no more"
+
+
+def change_of(jumps: torch.nn.Module, config: PeptideConfig, name: str) -> float:
+    """Both directions of psi of a residue together."""
+    levels = jumps.of_change[0, 2 + config.types.index(name), 1]
+    return float(levels[0, 1] + levels[1, 0])
+
+
+def test_how_far_populations_err_is_told_by_runs() -> None:
+    frames = _frames("ACE-ALA-NME", kind="psi")
+    config = with_scale(PeptideConfig(width=16, n_layers=1, n_heads=1, chunk_frames=4), [frames])
+    model = PeptideSlide(config).requires_grad_(False)
+
+    def error(order: np.ndarray, n_runs: int) -> float:
+        starts = np.arange(n_runs + 1) * 2 * EACH // n_runs
+        some = replace(frames, coordinates=frames.coordinates[order], starts=starts)
+        subject = PeptideSubject(some, chain_features(some.scene, config), np.ones(2 * EACH))
+        (change,) = lacking_populations(model, subject)
+        return change.variance
+
+    assert error(MIXED, 8) < 1e-6, "all runs say the same"
+    # Four of eight runs on either side: a share of a half, known to 1/2 / sqrt(7), and its logit to four times that.
+    assert error(np.arange(2 * EACH), 8) == pytest.approx(4.0 / 7.0, rel=0.2)
 
 
 def test_how_likely_the_rare_side_is_sets_the_probabilities() -> None:
