@@ -47,8 +47,8 @@ LEVELS = {"pace": set_pace, "populations": set_populations}
 
 
 def sets_of(folders: Sequence[Path], runs: int = 10_000, *, umbrella: bool = False) -> list[TrainingFrames]:
-    """Return the frames of every molecule in folders, of so many runs at most, with or without an umbrella. Raises InputError for none, and for
-    residues that weights are tested on, whatever their ends."""
+    """Return the frames of every molecule in folders, of so many runs at most, under an `umbrella` potential or none.
+    Raises InputError for no frames, and for residues that weights are tested on, whatever their ends."""
     tested = {"-".join(p.residues) for p in (*unseen_peptides(), *held_out_peptides()) if len(p.residues) > 1}
     found = []
     for place in (place for folder in folders for place in sorted(folder.iterdir()) if place.is_dir()):
@@ -73,7 +73,7 @@ def trained_with(provenance: dict[str, Any] | None) -> dict[str, float]:
 
 
 def with_levels(
-    sets: Sequence[TrainingFrames], start: Weights, energies: dict[str, float], out: Path, set: str
+    sets: Sequence[TrainingFrames], start: Weights, energies: dict[str, float], out: Path, what: str
 ) -> None:
     """Write weights with the pace or the populations that frames show."""
     model = cast(PeptideSlide, start.model)
