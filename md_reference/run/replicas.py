@@ -40,7 +40,13 @@ from systems.errors import InputError, SimulationError, SurromdError
 from systems.interrupts import deferred_interrupt, end_with_parent
 from systems.scene import FloatArray, Scene
 from systems.trajectory.base import TrajectoryWriter
-from systems.trajectory.checkpoint import checkpoint_path, locked_outputs, supported_checkpoint, writer_at
+from systems.trajectory.checkpoint import (
+    checkpoint_path,
+    locked_outputs,
+    read_checkpoint,
+    supported_checkpoint,
+    writer_at,
+)
 
 
 def simulate_batch(
@@ -86,6 +92,25 @@ def simulate_batch(
         state_path.unlink(missing_ok=True)
 
 
+def where_left(scene: Scene, config: MDConfig, outs: Sequence[Path]) -> FloatArray:
+    """Return the positions `(n, n_atoms, 3)` nm, water and all, of SIMD replicas that were stopped; none of a batch
+    that ended."""
+    found = [np.zeros((0, scene.n_atoms, 3))]
+    for first in range(0, len(outs), n_replicas()):
+        batch = list(outs[first : first + n_replicas()])
+        if not checkpoint_path(batch[0]).exists():
+            continue
+        simd = _simd(config, system_of(scene, config))
+        simd.restore(read_checkpoint(checkpoint_path(batch[0]))[1])
+        found.append(simd.positions_nm[: len(batch)])
+    return np.concatenate(found)
+
+
+def _simd(config: MDConfig, system: Any) -> SimdReplicas:
+    bath: dict[str, Any] = {"temperature_k": config.temperature_k, "friction_per_ps": config.friction_per_ps}
+    return SimdReplicas(system, **bath, timestep_ps=config.timestep_ps, seed=config.seed)
+
+
 class _Batch(StoredRun):
     """Replicas in the vector registers of one core."""
 
@@ -95,8 +120,7 @@ class _Batch(StoredRun):
     def start(self, starts_nm: npt.NDArray[np.floating] | None) -> None:
         """Go to where the batch was left, or to the starts, and equilibrate. Raises SimulationError."""
         config, system = self.config, system_of(self.scene, self.config)
-        bath: dict[str, Any] = {"temperature_k": config.temperature_k, "friction_per_ps": config.friction_per_ps}
-        self.simd = SimdReplicas(system, **bath, timestep_ps=config.timestep_ps, seed=config.seed)
+        self.simd = _simd(config, system)
         self.n_dof = self.simd.n_dof
         if self.resumed:
             self.simd.restore(self.blob)

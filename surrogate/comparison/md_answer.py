@@ -113,11 +113,11 @@ class StateEnergy:
 
 @dataclass(frozen=True, eq=False)
 class Answer:
-    """What MD says of a molecule, or a learned potential's rollout that its reference's energies reweight: `energies`
-    says of how many frames, and how many are effective. `weights`: of every frame, an array a replica; `lag_ps` between
-    frames; `timescales_ps` with `timescale_errors_ps`, descending; `states`; `maps`: for each residue the free energy
-    in kJ/mol `(36, 36)` over φ and ψ, from -180°, infinity where MD never was; `has_images`: whether each replica
-    counts with its mirror image; `missing`: what it cannot tell."""
+    """What MD says of a molecule, or a learned potential's rollout that its reference's energies reweight, or MD under
+    an umbrella potential (`under_umbrella`): `energies` says of how many frames, and how many are effective. `weights`:
+    of every frame, an array a replica; `lag_ps` between frames; `timescales_ps` with `timescale_errors_ps`, descending;
+    `states`; `maps`: for each residue the free energy in kJ/mol `(36, 36)` over φ and ψ, from -180°, infinity where MD
+    never was; `has_images`: whether each replica counts with its mirror image; `missing`: what it cannot tell."""
 
     method: str
     n_replicas: int
@@ -134,24 +134,31 @@ class Answer:
     missing: tuple[str, ...]
     weights: tuple[FloatArray, ...]
     energies: tuple[int, float] = (0, 0.0)
+    under_umbrella: bool = False
 
     @property
     def is_reweighted(self) -> bool:
         return self.energies[0] > 0
 
     @property
+    def is_of_rollout(self) -> bool:
+        """Whether it is of a rollout that its reference's energies reweight."""
+        return self.is_reweighted and not self.under_umbrella
+
+    @property
     def relaxation_ps(self) -> tuple[float, ...]:
-        """Relaxation times of MD; none of a reweighted rollout, whose torsions Monte Carlo turns."""
+        """Relaxation times of MD; none of a reweighted rollout, whose torsions Monte Carlo turns, or under an umbrella
+        potential, which they do not tell."""
         return () if self.is_reweighted else self.timescales_ps
 
     @property
     def whose(self) -> str:
         """Whose populations these are, before the noun."""
-        return "the reweighted" if self.is_reweighted else "MD's"
+        return "the reweighted" if self.is_of_rollout else "MD's"
 
     @property
     def _theirs(self) -> str:
-        return f"{self.whose} ones" if self.is_reweighted else self.whose
+        return f"{self.whose} ones" if self.is_of_rollout else self.whose
 
     @property
     def is_sure(self) -> bool:
@@ -208,7 +215,7 @@ class Answer:
                 what, shown = f"They show which states there are: {n}.", "populations"
             use = f"Do not use {self.whose} {shown} yet."
         else:
-            use = "Use the reweighted rollout" if self.is_reweighted else "Use MD's answer"
+            use = "Use the reweighted rollout" if self.is_of_rollout else "Use MD's answer"
             use += ", except for states that few or no transitions connect." if self.missing else "."
             what = f"For populations and free energies of {len(weighted)} states, each to {widest:.2g} % or better"
             what += " (one standard error)" + (", and relaxation times." if self.relaxation_ps else ".")
@@ -224,10 +231,14 @@ class Answer:
             not_yet = f" and by itself off by up to {off:.2g} %" if off else " and connects no states"
         else:
             not_yet = (
-                "" if self.is_sure else "; it has not converged" if self.is_reweighted else " and has not converged"
+                "" if self.is_sure else "; it has not converged" if self.is_of_rollout else " and has not converged"
             )
         by = f"MD is {length}, weighed by {self.tests}"
-        if self.is_reweighted:
+        if self.under_umbrella:
+            asked, effective = self.energies
+            by = f"MD under an umbrella potential of torsions is {length}, weighed by {self.tests} and by it, which "
+            by += f"leaves {effective:.0f} of {asked} frames effective"
+        if self.is_of_rollout:
             asked, effective = self.energies
             by = f"the rollout is {length}, weighed by {self.tests} and by its reference's energies at {asked} frames, "
             by += f"of which {effective:.0f} are effective"
@@ -265,7 +276,7 @@ class Answer:
         maps = {k: [[x if math.isfinite(x) else None for x in row] for row in m.tolist()] for k, m in self.maps.items()}
         own = {
             "in_short": list(self.in_short),
-            "populations_by": "MD and surrogate" if self.is_joint else "reweighting" if self.is_reweighted else "MD",
+            "populations_by": "MD and surrogate" if self.is_joint else "reweighting" if self.is_of_rollout else "MD",
             "on_surrogate": self.on_surrogate,
             "states": states,
             "maps_kj_mol": maps,
@@ -409,8 +420,8 @@ def md_answer(
         asked = len(known), float(known.sum() ** 2 / np.square(known).sum())
         weights = _reweighted(found, micro, counting)
         if asked[1] < _LEAST_EFFECTIVE:
-            why = ": a longer `budget` asks for more"
-            if asked[1] < _LEAST_SHARE * asked[0]:
+            why = ": a longer `budget` makes more"
+            if md.differences_kj_mol is None and asked[1] < _LEAST_SHARE * asked[0]:
                 why = ", the surrogate is too far off: give one of this molecule (`surromd train`) as `weights`"
             missing.append(f"only {asked[1]:.0f} of {asked[0]} frames are effective{why}")
     answer = Answer(
@@ -429,6 +440,7 @@ def md_answer(
         missing=tuple(dict.fromkeys(missing)),
         weights=with_mean_one(weights[: found.n_own]),
         energies=asked,
+        under_umbrella=md.differences_kj_mol is not None,
     )
     if surrogate is None or own is None or not answer.wants_surrogate or answer.has_images:
         return answer

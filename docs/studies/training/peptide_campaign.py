@@ -43,7 +43,7 @@ from processes import arguments_of, in_order, only_here, parts_of, run_path, sim
 from md_reference.forces.forcefield import build_system
 from md_reference.forces.solvation import solvate
 from md_reference.forces.spec import ForceFieldSpec, WaterBox
-from md_reference.forces.umbrella import Umbrella
+from md_reference.forces.umbrella import Umbrella, umbrella_torsions
 from md_reference.run.config import SIMD, Conditions, MDConfig
 from md_reference.run.engine import Engine
 from md_reference.simd.force_field import SimdReplicas, n_replicas
@@ -69,9 +69,9 @@ SAVED_PS = {"tip3p": 1.0, "obc2": 5.0}
 FINE_PS, FINE_SAVED_PS = 300.0, 1.0
 HOT_K, HOT_PS, COOL_PS = 500.0, 100.0, 100.0
 TURNED_PS, STIFFNESS_KJ_MOL = 20.0, 300.0
-# Under an umbrella potential: what is left of the free energy of psi and of side chains, the MD in OBC2 that tells it,
-# its first part left out where starts are drawn, and the runs in water.
-LEFT_KT, RESOLVED_PS, RESOLVED_EVERY_PS, RELAXED = (1.5, 2.5), 1200.0, 0.4, 0.2
+# For an umbrella potential: the MD in OBC2 that tells it, its first part left out where starts are drawn, and the runs
+# in water.
+RESOLVED_PS, RESOLVED_EVERY_PS, RELAXED = 1200.0, 0.4, 0.2
 UMBRELLA_PS, UMBRELLA_TEST_PS = 200.0, 500.0
 
 
@@ -105,22 +105,19 @@ def many_states(dry: Scene, seed: int) -> FloatArray:
 def umbrella_of(dry: Scene, seed: int) -> tuple[Umbrella, FloatArray]:
     """Return the umbrella potential of psi and side chains that MD in OBC2 tells, and positions `(n_replicas, n_atoms,
     3)` with every phi negative."""
-    system, backbone = build_system(dry, IMPLICIT), backbone_torsions(dry)
+    system, phis = build_system(dry, IMPLICIT), backbone_torsions(dry)["phi"]
     run = dynamics(system, 300.0, seed + 2, friction_per_ps=1.0, timestep_ps=0.004)
     run.set_positions(many_states(dry, seed))
     run.thermalise()
-    bonds = {tuple(sorted(quad[1:3])) for kind in ("phi", "psi") for quad in backbone[kind].tolist()}
-    side = [quad for quad in rotatable_torsions(dry).tolist() if tuple(sorted(quad[1:3])) not in bonds]
-    quads = np.concatenate([backbone["psi"], np.array(side, dtype=np.int64).reshape(-1, 4)])
+    quads, left_kt = umbrella_torsions(dry)
     angles, starts = [], []
     for k in range(n := round(RESOLVED_PS / RESOLVED_EVERY_PS)):
         run.step(round(RESOLVED_EVERY_PS / run.timestep_ps))
         x = run.positions_nm
         angles.append(torsion(x, quads))
         if k >= RELAXED * n:
-            phi = np.rad2deg(torsion(x, backbone["phi"]))
+            phi = np.rad2deg(torsion(x, phis))
             starts.append(x[~((phi > POSITIVE_PHI_DEG[0]) & (phi < POSITIVE_PHI_DEG[1])).any(axis=1)])
-    left_kt = [LEFT_KT[quad >= len(backbone["psi"])] for quad in range(len(quads))]
     pool = np.concatenate(starts)
     picks = np.random.default_rng(seed).choice(len(pool), run.n_replicas, replace=len(pool) < run.n_replicas)
     return Umbrella.of(quads, np.concatenate(angles), left_kt, 300.0), pool[picks]

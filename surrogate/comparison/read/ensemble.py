@@ -351,6 +351,8 @@ def reweighting_notes(
     """Return how far a learned potential's frames are those of its reference, where a rollout asked it; else
     nothing."""
     temperature = records[0].get("temperature_k") if records else None
+    if any(record.get("umbrella") for record in records):
+        return []
     columns = [s[DIFFERENCE_COLUMN] for s in scalars if DIFFERENCE_COLUMN in s]
     if not columns or not isinstance(temperature, int | float):
         return []

@@ -13,7 +13,7 @@ from systems.errors import InputError
 from systems.units import format_time_ps, format_wall
 
 Way = Literal["md", "rollout", "potential"]
-Stage = Literal["train", "rollout", "energies", "md", "held-out md", "report"]
+Stage = Literal["train", "rollout", "energies", "umbrella md", "md", "held-out md", "report"]
 
 
 class Plan(NamedTuple):
@@ -27,6 +27,9 @@ class Plan(NamedTuple):
 # Some time goes into MD where that comes to so many ps; below it would tell nothing.
 _REWEIGHTED: dict[Stage, float] = {"rollout": 0.7, "energies": 0.3}
 _MD_BESIDE, _LEAST_MD_PS = 0.3, 50.0
+# In explicit water MD is slow, and most of its time goes into replicas under an umbrella potential that the rollout
+# tells, where there is so much of it that they make frames: so many times what it takes to begin.
+_UMBRELLA, _UMBRELLA_BEGINS = 0.7, 4.0
 # MD without a surrogate is compared with itself: it is split by replicas, or by stages if there is one replica.
 PLANS: dict[Way, Plan] = {
     "md": Plan("MD for the whole budget", {"md": 1.0}),
@@ -43,6 +46,7 @@ _TOGETHER = "MD and a rollout together"
 # MD's answer rests on no assumption: what saves less of its error does not pay.
 _PAYS = 0.9
 MD_STAGES: tuple[Stage, ...] = ("md", "held-out md")
+ALL_MD_STAGES: tuple[Stage, ...] = (*MD_STAGES, "umbrella md")
 LEAST_BUDGET_S = 20.0
 # Of a replica in explicit water.
 _LEAST_MD_FRAMES = 4
@@ -117,7 +121,7 @@ def decide(
     shares = _shares(rates, chosen, budget_s, left_s)
     stages = [PlannedStage(name, left_s * share) for name, share in shares.items()]
     found = Decision(chosen, why, (*stages, PlannedStage("report", comparison_s)), 0.0, 0.0, 0.0, 0.0)
-    md = [md_ps(rates, found, name) for name in shares if name in MD_STAGES]
+    md = [md_ps(rates, found, name) for name in shares if name in ALL_MD_STAGES]
     rolled_ps = found.seconds("rollout") * (rates.rolls.ps_per_s if rates.rolls else 0.0)
     return replace(
         found,
@@ -140,7 +144,11 @@ def _shares(rates: Rates, way: Way, budget_s: float, left_s: float) -> dict[Stag
         found: dict[Stage, float] = {name: (1.0 - beside) * share for name, share in _REWEIGHTED.items()}
         return {**found, "held-out md": beside} if beside else found
     rolled = min(reversed(_ROLLED), key=lambda share: expected_errors(rates, budget_s, rolled=(share,))[_TOGETHER])
-    return {"rollout": rolled, "held-out md": 1.0 - rolled}
+    own = 1.0 - rolled
+    weighs = _UMBRELLA * own if rates.explicit and rates.at_once > 1 else 0.0
+    if weighs * left_s <= _UMBRELLA_BEGINS * rates.begins_s:
+        return {"rollout": rolled, "held-out md": own}
+    return {"rollout": rolled, "umbrella md": weighs, "held-out md": own - weighs}
 
 
 def least_budget_s(rates: Rates) -> float:
@@ -279,11 +287,13 @@ def table(rates: Rates, decision: Decision, budget_s: float) -> dict[str, str]:
         lines["by rollout"] = f"{per_day(rolls.ps_per_s)}, {rolls.replicas} replicas of {rolls.weights}"
     reweighted = decision.seconds("energies") and decision.way == "rollout"
     words = "a rollout whose frames the reference's energies weigh" if reweighted else PLANS[decision.way].words
+    if decision.seconds("umbrella md"):
+        words += ", under an umbrella potential of its torsions"
     lines |= {"way": words, "because": "; ".join(decision.why)}
     for name, seconds in ((stage.name, stage.seconds) for stage in decision.stages):
         lines[name] = format_wall(seconds)
         to_come_ps = decision.expected_rollout_ps if name == "rollout" else md_ps(rates, decision, name)
-        if name in (*MD_STAGES, "rollout") and to_come_ps:
+        if name in (*ALL_MD_STAGES, "rollout") and to_come_ps:
             lines[name] += f", about {format_time_ps(to_come_ps, 2)}"
     lines["in all"] = f"{format_wall(budget_s)}, frames every {format_time_ps(decision.save_every_ps)}"
     return lines

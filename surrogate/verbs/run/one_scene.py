@@ -21,6 +21,7 @@ from surrogate.progress import ProgressFn, progress_bar
 from surrogate.verbs.inputs import prepare_scene
 from surrogate.verbs.options import RunOptions, tell
 from surrogate.verbs.run.decision import (
+    ALL_MD_STAGES,
     LEAST_MD_S,
     MD_STAGES,
     RESTART_S,
@@ -241,7 +242,7 @@ class _Run:
         name: Stage = pending[0].name
         stage, record = STAGES[name], self.record
         assert record.rates is not None
-        there = stage.found(self.site, record) if name in (*MD_STAGES, "rollout") else None
+        there = stage.found(self.site, record) if name in (*ALL_MD_STAGES, "rollout") else None
         may_take_s = seconds_of_first(pending, self.clock.budget_s - self.clock.spent_s)
         if name in (*MD_STAGES, "energies") and there is None:  # without what to compare with all else was in vain
             may_take_s = max(may_take_s, LEAST_MD_S * max(1.0, 0.5 * record.rates.stretch))

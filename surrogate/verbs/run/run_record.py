@@ -63,7 +63,7 @@ class Outcome:
 @dataclass(frozen=True)
 class RunRecord:
     """A run on its way or done. `settings`: what was asked for, in our units; `spent_s` of its budget, `spent_in` each
-    stage; `trajectory`, `held_out`: files, relative to the folder; `weights`: a file there, or the name of
+    stage; `trajectory`, `umbrella`, `held_out`: files, relative to the folder; `weights`: a file there, or the name of
     shipped ones; `simd_failed`: the number of SIMD replicas when MD by them failed, else 0."""
 
     scene: str
@@ -79,6 +79,7 @@ class RunRecord:
     decision: Decision | None = None
     stages: tuple[StageEntry, ...] = ()
     trajectory: tuple[str, ...] = ()
+    umbrella: tuple[str, ...] = ()
     held_out: tuple[str, ...] = ()
     weights: str = ""
     simd_failed: int = 0
@@ -164,7 +165,7 @@ class RunResult(dict[str, Any]):
     def md(self) -> list[Path]:
         """Files of all MD that the answer is of; `sm.frame_weights` gives the weights of their frames."""
         own = self["trajectory"] if (self["decision"] or {}).get("way") == "md" else []
-        return [self.folder / file for file in (*own, *self["held_out"])]
+        return [self.folder / file for file in self["umbrella"] or (*own, *self["held_out"])]
 
     @property
     def report(self) -> Path:

@@ -31,14 +31,16 @@ from surrogate.verbs.run.run_record import ANSWER_NAME, ENERGIES_NAME, REPORT_NA
 from surrogate.verbs.simulate import rollout
 from surrogate.verbs.train import train
 from systems.errors import InputError, SimulationError
+from systems.files.schema import built
 from systems.files.whole_file import create_whole, replica_paths
 from systems.options import Preparation
 from systems.scene import Scene
 from systems.trajectory.checkpoint import checkpoint_path, frames_in
-from systems.trajectory.codec import frame_factors, write_weights
+from systems.trajectory.codec import frame_factors, open_trajectory, write_weights
 from systems.units import format_time_ps, format_wall
 
 if TYPE_CHECKING:
+    from md_reference.forces.umbrella import Umbrella
     from surrogate.comparison.comparison import Comparison, Evaluation, Summary
     from surrogate.comparison.equivalent_time import EquivalentTime
 
@@ -54,7 +56,7 @@ _TORSION_MOVES = 3
 # Of MD's time goes into relaxing frames of a rollout to begin at; in less, fewer replicas begin apart, but so many.
 _STARTING, _LEAST_STARTS = 0.15, 4
 # Runs of one scene whose seeds differ by this are independent, replicas and all.
-_SEEDS_APART = 10_000
+_SEEDS_APART, _UMBRELLA_SEED = 10_000, 2
 # Of a run's report, where frames have weights.
 UNWEIGHTED = (
     "This comparison counts all frames alike; their weights at equilibrium are in the lines on top, in the maps below "
@@ -107,29 +109,7 @@ def _md_stage(name: Stage, place: str, seed: int) -> StageOf:
         return outs(site, record.rates.replicas, "-openmm" if record.simd_failed else "")
 
     def work(site: Site, record: RunRecord) -> RunRecord:
-        from md_reference.run.replicas import simulate_replicas
-
-        rates, decision = _rates_and_decision(record)
-        every_ps = decision.save_every_ps
-        expected_ps = md_ps(rates, decision, name) / rates.replicas
-        config = replace(
-            site.config,
-            time_ps=every_ps * max(_LEAST_FRAMES, math.ceil(_AMPLE * rates.stretch * expected_ps / every_ps)),
-            save_every_ps=every_ps,
-            equilibrate_ps=min(site.config.equilibrate_ps, decision.equilibrate_ps),
-            platform=rates.platform,
-            seed=site.options.seed + seed * _SEEDS_APART,
-        )
-        files = by_now(site, record)
-        files[0].parent.mkdir(exist_ok=True)
-
-        def heard(said: str | SimulationError) -> None:
-            if isinstance(said, SimulationError) and rates.at_once > 1:  # nothing to wait for
-                raise said
-
-        with summarised_outputs(files):
-            starts, config = _starts(site, record, config, files)
-            simulate_replicas(starts, config, files, resume=True, announce=heard)
+        _simulate(site, record, by_now(site, record), name, seed)
         done = found(site, record)
         if done is None:
             raise InputError("MD wrote fewer than two frames, too few to evaluate.")
@@ -151,12 +131,88 @@ def _md_stage(name: Stage, place: str, seed: int) -> StageOf:
     return StageOf(work, found)
 
 
-def _starts(site: Site, record: RunRecord, config: MDConfig, files: list[Path]) -> tuple[Scene | list[Scene], MDConfig]:
-    """Return where replicas of MD begin, and their settings: at frames of the rollout, drawn over all its states, where
-    there is one, else at states of hot MD, which takes a small part of their time."""
+def _simulate(site: Site, record: RunRecord, files: list[Path], name: Stage, seed: int) -> None:
+    """Simulate replicas of a stage into `files`, until it is over."""
+    from md_reference.run.replicas import simulate_replicas
+
+    rates, config = _rates_and_decision(record)[0], _config(site, record, name, seed)
+    files[0].parent.mkdir(exist_ok=True)
+
+    def heard(said: str | SimulationError) -> None:
+        if isinstance(said, SimulationError) and rates.at_once > 1:  # nothing to wait for
+            raise said
+
+    with summarised_outputs(files):
+        starts, config = _starts(site, record, config, files, name)
+        simulate_replicas(starts, config, files, resume=True, announce=heard)
+
+
+def _config(site: Site, record: RunRecord, name: Stage, seed: int) -> MDConfig:
+    """Return the settings of a stage of MD: longer than it can be in its time."""
+    rates, decision = _rates_and_decision(record)
+    every_ps = decision.save_every_ps
+    expected_ps = md_ps(rates, decision, name) / rates.replicas
+    return replace(
+        site.config,
+        time_ps=every_ps * max(_LEAST_FRAMES, math.ceil(_AMPLE * rates.stretch * expected_ps / every_ps)),
+        save_every_ps=every_ps,
+        equilibrate_ps=min(site.config.equilibrate_ps, decision.equilibrate_ps),
+        platform=rates.platform,
+        seed=site.options.seed + seed * _SEEDS_APART,
+        umbrella=_umbrella(site, record) if name == "umbrella md" else None,
+    )
+
+
+def _umbrella(site: Site, record: RunRecord) -> Umbrella:
+    """Return the umbrella potential that the rollout tells, of atoms of the scene in its water; the one that MD has
+    begun under where there is some."""
+    from md_reference.forces.mixture import solute_of
+    from md_reference.forces.umbrella import Umbrella, umbrella_torsions
+    from systems.chemistry.geometry import torsion
+
+    begun = _umbrella_files(site, record)[0]
+    if begun.exists():
+        with open_trajectory(begun) as reader:
+            return built(Umbrella, reader.record["umbrella"])
+    dry = dry_part(site.scene)
+    rolled = load_ensemble([site.folder / file for file in record.trajectory], template=dry)
+    quads, left_kt = umbrella_torsions(dry)
+    angles = np.concatenate([np.asarray(torsion(x[:], quads)) for x in rolled.segments])
+    atoms = np.arange(dry.n_atoms) if site.scene.cell_nm is None else np.asarray(solute_of(site.scene))
+    return Umbrella.of(atoms[quads], angles[np.isfinite(angles).all(axis=1)], left_kt, site.config.temperature_k)
+
+
+def _umbrella_files(site: Site, record: RunRecord) -> list[Path]:
+    assert record.rates is not None
+    return replica_paths(site.folder / f"reference/umbrella.{site.options.format}", record.rates.replicas)
+
+
+def _under_umbrella(site: Site, record: RunRecord) -> RunRecord:
+    _simulate(site, record, _umbrella_files(site, record), "umbrella md", _UMBRELLA_SEED)
+    return _were_under_umbrella(site, record) or record
+
+
+def _were_under_umbrella(site: Site, record: RunRecord) -> RunRecord | None:
+    files = _with_frames(site.folder, _umbrella_files(site, record))
+    return replace(record, umbrella=files) if files else None
+
+
+def _starts(
+    site: Site, record: RunRecord, config: MDConfig, files: list[Path], name: Stage
+) -> tuple[Scene | list[Scene], MDConfig]:
+    """Return where replicas of MD begin, and their settings: where those under an umbrella potential were left, water
+    and all, or at frames of the rollout, drawn over all its states, where there is one, else at states of hot MD, which
+    takes a small part of their time."""
+    from md_reference.run.replicas import where_left
     from md_reference.run.starts import HOT_PS, frames_as_starts, many_starts
 
     rates, decision = _rates_and_decision(record)
+    if record.umbrella and name == "held-out md" and rates.at_once > 1:
+        left_nm = where_left(site.scene, _config(site, record, "umbrella md", _UMBRELLA_SEED),
+                             _umbrella_files(site, record))  # fmt: skip
+        if len(left_nm):
+            scenes = [replace(site.scene, positions_nm=left_nm[k % len(left_nm)]) for k in range(len(files))]
+            return scenes, replace(config, starts="rollout")
     if config.starts == "one" or len(files) < 2:
         return site.scene, config
     rolled = None
@@ -171,7 +227,7 @@ def _starts(site: Site, record: RunRecord, config: MDConfig, files: list[Path]) 
     if rolled is not None:
         with suppress(SimulationError):
             frames = frames_over_states(rolled, 2 * len(files), seed=site.options.seed)
-            in_time = _until(frames, _STARTING * decision.seconds("held-out md"))
+            in_time = _until(frames, _STARTING * decision.seconds(name))
             return list(frames_as_starts(site.scene, config, in_time, len(files), hot_ps=hot_ps)[0]), config
     return list(many_starts(site.scene, config, len(files), hot_ps=hot_ps)[0]), config
 
@@ -328,7 +384,7 @@ def outcome(
     lines = evaluated.in_short if answer is None else answer.in_short
     on_surrogate = answer.on_surrogate if answer else ""
     if answer is not None and on_surrogate and not answer.is_sure and not answer.is_joint:
-        what = "The rollout" if answer.is_reweighted else "MD"
+        what = "The rollout" if answer.is_of_rollout else "MD"
         on_surrogate = f"{what} has not converged, and cannot say whether the surrogate's populations are right."
     return Outcome(
         headline=" ".join(lines), in_short=lines,
@@ -434,6 +490,11 @@ def answer_of(site: Site, record: RunRecord) -> Answer | None:
     rolled = None if is_md else load_ensemble(frames)
     answer = None if rolled is None else _reweighted(site, rolled)
     files = frames
+    if record.umbrella and rolled is not None:
+        files = [site.folder / file for file in record.umbrella]
+        under = load_ensemble(files, template=rolled.scene)
+        with suppress(InputError):
+            answer = md_answer(under, site.config.temperature_k, surrogate=rolled, seed=site.options.seed)
     held_out = [*(frames if is_md else ()), *(site.folder / file for file in record.held_out)]
     if held_out and (answer is None or not answer.is_sure):
         md = load_ensemble(held_out, template=None if rolled is None else rolled.scene)
@@ -543,6 +604,7 @@ STAGES: dict[str, StageOf] = {
     "held-out md": _md_stage("held-out md", "reference/held_out", 1),
     "train": StageOf(_train, _trained, may_fail=True),
     "rollout": StageOf(_roll, _rolled, may_fail=True),
+    "umbrella md": StageOf(_under_umbrella, _were_under_umbrella, may_fail=True),
     "energies": StageOf(_ask, _asked, may_fail=True),
     "report": StageOf(_report, lambda site, record: None),
 }

@@ -14,7 +14,7 @@ from md_reference.forces.spec import ForceFieldSpec
 from md_reference.run import replicas
 from md_reference.run.config import MDConfig
 from md_reference.run.plan import make_plan
-from md_reference.run.replicas import simulate_batch, simulate_replicas
+from md_reference.run.replicas import simulate_batch, simulate_replicas, where_left
 from systems.errors import InputError, SimulationError
 from systems.prepare.peptide import build_peptide
 from systems.trajectory.checkpoint import checkpoint_path
@@ -59,6 +59,10 @@ def test_what_was_stopped_goes_on_as_if_it_had_not_been(tmp_path: Path, monkeypa
     with pytest.raises(KeyboardInterrupt):
         simulate_batch(SCENE, CONFIG, parts, progress=stop)
     assert len(_frames(parts[1])) == 3 and checkpoint_path(parts[0]).exists()
+    left_nm = where_left(SCENE, CONFIG, parts)
+    last = np.stack([_frames(part)[-1] for part in parts])
+    assert np.allclose(left_nm, last, atol=1e-6) and not np.allclose(left_nm[0], left_nm[1])
+    assert len(where_left(SCENE, CONFIG, whole)) == 0, "they have ended"
     with pytest.raises(InputError, match="friction"):
         simulate_batch(SCENE, replace(CONFIG, friction_per_ps=2.0), parts, resume=True)
     simulate_batch(SCENE, CONFIG, parts, resume=True)

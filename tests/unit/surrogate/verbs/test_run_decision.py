@@ -198,8 +198,19 @@ def test_a_budget_in_explicit_water_is_enough_for_md_to_begin() -> None:
     assert wet.begins_s == pytest.approx(8.0 + 16 * 16.0 / 16.4)
     with pytest.raises(InputError, match=r"a budget of 60 s is too short: .* takes 2\.42 min .* Use `budget_s='150s'`"):
         decide(wet, 60.0)
-    md_s = decide(wet, 150.0).seconds("held-out md")
+    short, long = decide(wet, 150.0), decide(wet, 600.0)
+    md_s = short.seconds("held-out md")
     assert md_s > wet.begins_s + 4 * 10.0 * 16 / 16.4, "four frames of each replica, if MD has half of the time"
+    assert named(short) == ["rollout", "held-out md", "report"], "too short to begin twice"
+    assert named(long) == ["rollout", "umbrella md", "held-out md", "report"]
+    assert long.seconds("umbrella md") > 2 * wet.begins_s and long.seconds("umbrella md") > 2 * long.seconds(
+        "held-out md"
+    )
+    both_ps = 16.4 * (long.seconds("umbrella md") + long.seconds("held-out md"))
+    assert long.expected_md_ps == pytest.approx(both_ps)
+    assert "umbrella" in table(wet, long, 600.0)["way"] and "umbrella" not in table(wet, short, 150.0)["way"]
+    by_openmm = replace(wet, at_once=1, platform="auto")
+    assert named(decide(dry, 600.0, "surrogate")) == named(decide(by_openmm, 3600.0, "surrogate")) == named(short)
 
 
 def test_a_budget_that_is_not_given_is_ten_minutes() -> None:

@@ -24,18 +24,23 @@ from surrogate.verbs.run.rates import REPLICAS, Rates, Rolls
 from surrogate.verbs.run.run_record import RunRecord, read_run, write_run
 from surrogate.verbs.run.stages import Site, StageOf
 from systems.errors import InputError, SimulationError
-from systems.trajectory.codec import open_trajectory
+from systems.library.named_scenes import prepare
+from systems.trajectory.codec import frame_weights, open_trajectory
 
 # As if a second of MD made a hundredth of a ps: runs end by their length, not by the clock.
 RATES = Rates(22, 1, 1.0, False, "OBC2", 5e-3, 0.004, 0.1, "trained on it", Rolls("peptides", 1.0, 0.25))
 BUDGET_S = 400.0
 OPENMM, SIMD = RATES, replace(RATES, platform="simd", at_once=16, md_ps_per_s=0.8)
+# As if the molecule were in water, and the water not there.
+WET = replace(SIMD, explicit=True, step_s=1e-4, md_ps_per_s=8.0)
 needs_compiler = pytest.mark.skipif(not (shutil.which("g++") or shutil.which("c++")), reason="no C++ compiler")
 WAYS = [
     pytest.param(("md", OPENMM, ["md", "held-out md", "report"]), id="one replica"),
     pytest.param(("md", SIMD, ["md", "report"]), id="simd", marks=needs_compiler),
     pytest.param(("surrogate", OPENMM, ["rollout", "held-out md", "report"]), id="rollout"),
-]
+    pytest.param(("surrogate", WET, ["rollout", "umbrella md", "held-out md", "report"]), id="umbrella",
+                 marks=needs_compiler),
+]  # fmt: skip
 Way = tuple[str, Rates, list[str]]
 
 
@@ -131,10 +136,64 @@ def test_kills_before_and_after_each_stage_change_nothing(
     assert ended(found) == ended(expected) and found["outcome"] == expected["outcome"]
     assert run_ids(killed) == begun, "nothing was made twice"
     kept, undisturbed = frames(killed), frames(whole)
-    assert len(kept) == {"md": rates.replicas, "surrogate": REPLICAS}[asked] + (rates is OPENMM)
+    beside = {OPENMM: 1, SIMD: 0, WET: 2 * rates.replicas}[rates]
+    assert len(kept) == {"md": rates.replicas, "surrogate": REPLICAS}[asked] + beside
     assert kept.keys() == undisturbed.keys()
     for name, positions in undisturbed.items():
         assert np.array_equal(kept[name], positions), name
+
+
+@needs_compiler
+def test_md_under_an_umbrella_gives_the_answer_and_the_starts_of_held_out_md(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(one_scene, "measure", lambda *_: WET)
+    monkeypatch.setattr(one_scene, "decide", lambda rates, left_s, *how, **more: decide(rates, BUDGET_S, *how, **more))
+    monkeypatch.setitem(stages.STAGES, "report", replace(stages.STAGES["report"], work=evaluated_at_once))
+    folder, begun = tmp_path / "a", []
+    simulated = replicas.simulate_batch
+
+    def stopped(scene: Any, config: Any, outs: list[Path], **how: Any) -> None:
+        """The stage under an umbrella is stopped by the clock, as it always is."""
+        begun.append((config, how.get("starts_nm")))
+        if config.umbrella is not None:
+            simulated(scene, replace(config, time_ps=1.5 * config.time_ps), outs, **how | {"progress": at_end(config)})
+        else:
+            simulated(scene, config, outs, **how)
+
+    def at_end(config: Any) -> Callable[..., None]:
+        def progress(done: int, total: int, note: str | None = None) -> None:
+            if note is None and done >= config.n_frames:
+                raise KeyboardInterrupt
+
+        return progress
+
+    monkeypatch.setattr(replicas, "simulate_batch", stopped)
+    monkeypatch.setattr(one_scene.Clock, "work", lambda self, said, s, stage: ended_by_the_clock(stage))
+    found = run(folder, "surrogate")
+    assert ended(found) == [("rollout", "done"), ("umbrella md", "out of time"), ("held-out md", "done"),
+                            ("report", "done")]  # fmt: skip
+    (_, drawn), (config, left) = begun
+    assert config.umbrella is None and config.starts == "rollout"
+    with open_trajectory(folder / found["umbrella"][3]) as reader:
+        assert reader.record["umbrella"] and np.allclose(reader.read()[-1] - reader.read()[-1].mean(0),
+                                                        left[3] - left[3].mean(0), atol=1e-3)  # fmt: skip
+    assert drawn is not None and not np.allclose(drawn[3], left[3])
+    record = read_run(folder)
+    site = Site(folder, prepare("alanine-dipeptide"), config, RunOptions())
+    answer = stages.answer_of(site, record)
+    assert answer is not None and answer.under_umbrella and not answer.relaxation_ps
+    assert "MD under an umbrella potential of torsions is 16 replicas" in answer.in_short[2]
+    assert found.md == [folder / file for file in record.umbrella] and len(found.md) == 16
+    weights = np.concatenate([frame_weights(path) for path in found.md])
+    assert weights.std() > 0.1 and weights.mean() == pytest.approx(1.0)
+
+
+def ended_by_the_clock(stage: Callable[[], Any]) -> Any:
+    try:
+        return stage()
+    except KeyboardInterrupt:
+        return None
 
 
 @needs_compiler
