@@ -204,8 +204,8 @@ def _in_water(wet: Scene, conditions: Conditions, dry: Scene, frames: FloatArray
     out = np.empty((len(angles), wet.n_atoms, 3))
     for first in range(0, len(angles), n_replicas()):
         run = SimdReplicas(
-            system, temperature_k=conditions.temperature_k, friction_per_ps=FRICTION_PER_PS, timestep_ps=0.002,
-            seed=conditions.seed + first, biased=quads.tolist(),
+            system, temperature_k=conditions.temperature_k, friction_per_ps=FRICTION_PER_PS,
+            timestep_ps=conditions.timestep_ps, seed=conditions.seed + first, biased=quads.tolist(),
         )  # fmt: skip
         run.set_positions(np.repeat(start[None], run.n_replicas, axis=0))
         run.thermalise()

@@ -39,9 +39,10 @@ from md_reference.run.config import MDConfig
 from md_reference.run.machine import machine_name
 from md_reference.run.replicas import simulate_batch, simulate_replicas
 from md_reference.simd.force_field import n_replicas
+from surrogate.comparison.answer import Answer
 from surrogate.comparison.convergence import tested_reference
 from surrogate.comparison.equivalent_time import EquivalentTime
-from surrogate.comparison.md_answer import Answer, md_answer
+from surrogate.comparison.md_answer import md_answer
 from surrogate.comparison.measure.distributions import distance
 from surrogate.comparison.measure.slow_motion import angles_of
 from surrogate.comparison.measure.structure import Baseline, evenly

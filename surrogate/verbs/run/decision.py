@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Literal, NamedTuple
 
-from surrogate.comparison.md_answer import MODEL_ERROR
+from surrogate.comparison.answer import MODEL_ERROR
 from surrogate.verbs.run.rates import Rates
 from systems.errors import InputError
 from systems.units import format_time_ps, format_wall

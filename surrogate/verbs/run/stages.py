@@ -18,7 +18,8 @@ import numpy.typing as npt
 
 from md_reference.forces.mixture import dry_part
 from md_reference.run.config import MDConfig
-from surrogate.comparison.md_answer import Answer, frames_over_states, md_answer
+from surrogate.comparison.answer import Answer
+from surrogate.comparison.md_answer import frames_over_states, md_answer
 from surrogate.comparison.read.ensemble import STOPPED, Ensemble, load_ensemble
 from surrogate.comparison.verdict import LEAST_SAMPLES
 from surrogate.models.architecture import weights_path
@@ -496,7 +497,7 @@ def answer_of(site: Site, record: RunRecord) -> Answer | None:
         with suppress(InputError):
             answer = md_answer(under, site.config.temperature_k, surrogate=rolled, seed=site.options.seed)
     held_out = [*(frames if is_md else ()), *(site.folder / file for file in record.held_out)]
-    if held_out and (answer is None or not answer.is_sure):
+    if held_out and (answer is None or not (answer.is_sure or answer.under_umbrella)):
         md = load_ensemble(held_out, template=None if rolled is None else rolled.scene)
         with suppress(InputError):
             by_md = md_answer(md, site.config.temperature_k, surrogate=rolled, seed=site.options.seed)

@@ -11,9 +11,11 @@ import pytest
 
 from surrogate.comparison import convergence, markov
 from surrogate.comparison import md_answer as told
+from surrogate.comparison.answer import MODEL_ERROR, Answer
 from surrogate.comparison.markov import equilibrium, with_prior
-from surrogate.comparison.md_answer import Answer, frames_over_states, md_answer
+from surrogate.comparison.md_answer import frames_over_states, md_answer
 from surrogate.comparison.measure.torsions import find_torsions
+from surrogate.comparison.pooled import raked
 from surrogate.comparison.read.ensemble import Ensemble
 from surrogate.comparison.report.figures import answer_overview
 from systems.chemistry.graph import backbone_torsions, bonded_graph, turned
@@ -178,6 +180,63 @@ def test_md_answers_alone_where_a_surrogate_would_make_its_errors_larger(
     md = ensemble(forms, jumps(MATRIX, [0, 1, 2, 1] * 4, 150, 3))
     found = md_answer(md, 300.0, surrogate=rolled(forms, MATRIX))
     assert found.is_sure and not found.missing and found.is_joint == together
+
+
+UMBRELLA = np.array([[0.96, 0.04, 0.0], [0.04, 0.92, 0.04], [0.0, 0.04, 0.96]])  # a third each
+
+
+def under_umbrella(forms: np.ndarray, n: int, seed: int) -> Ensemble:
+    """MD under a potential that makes all states alike likely, which are POPULATIONS without it."""
+    states = jumps(UMBRELLA, [0, 1, 2, 1] * 4, n, seed)
+    differences = -8.314462618e-3 * 300.0 * np.log(POPULATIONS)
+    return dataclasses.replace(ensemble(forms, states, seed), differences_kj_mol=[differences[row] for row in states])
+
+
+def test_md_under_an_umbrella_tells_populations_without_it(forms: np.ndarray) -> None:
+    md = under_umbrella(forms, 2000, 1)
+    answer = md_answer(md, 300.0)
+    assert answer.under_umbrella and answer.is_sure and not answer.relaxation_ps
+    assert [s.share for s in answer.states] == pytest.approx(POPULATIONS, abs=0.03)
+    assert answer.in_short[0].startswith("Use MD's answer") and "relaxation times" not in answer.in_short[1]
+    assert "MD under an umbrella potential of torsions is 16 replicas" in answer.in_short[2]
+    assert md_answer(md, 300.0, surrogate=drawn(forms, np.array([0.3, 0.3, 0.4]))).to_dict()["populations_by"] == "MD"
+    unweighted = md_answer(dataclasses.replace(md, differences_kj_mol=None), 300.0)
+    assert abs(unweighted.states[0].share - 0.6) > 0.2, "negative control"
+
+
+def test_few_of_it_and_a_surrogate_are_pooled_by_their_errors(forms: np.ndarray) -> None:
+    own = drawn(forms, np.array([0.5, 0.38, 0.12]))
+    errors = []
+    for seed in range(6):
+        md = under_umbrella(forms, 20, 30 + seed)
+        alone, both = md_answer(md, 300.0), md_answer(md, 300.0, surrogate=own)
+        assert both.is_joint and both.under_umbrella and not alone.is_joint
+        errors.append((off(alone), off(both)))
+        for s, a in zip(both.states, alone.states, strict=True):
+            rolled_error = math.hypot(MODEL_ERROR, s.surrogate_error or 0.0)
+            assert s.error == pytest.approx((a.error**-2 + rolled_error**-2) ** -0.5)
+            assert s.by_md == pytest.approx((a.share, a.error))
+        assert sum(s.share for s in both.states) == pytest.approx(1.0)
+        weights, states = np.concatenate(both.weights), np.concatenate([_states(x) for x in md.segments])
+        shares = np.bincount(states, weights, minlength=3) / weights.sum()
+        assert shares == pytest.approx([s.share for s in both.states], abs=1e-3), "frames weigh as the states do"
+    alone, both = np.sqrt(np.mean(np.square(errors), axis=0))
+    assert both < 0.9 * alone
+
+
+def test_frames_are_weighted_to_the_shares_of_every_torsion() -> None:
+    rng = np.random.default_rng(0)
+    one, other = rng.integers(2, size=(3, 500)), rng.integers(3, size=(3, 500))
+    other[0, :5] = -1
+    weights = raked(
+        list(rng.random((3, 500))), [(list(one), np.array([0.7, 0.3])), (list(other), np.array([0.2, 0.5, 0.3]))]
+    )
+    every, known = np.concatenate(weights), other.ravel() >= 0
+    assert np.bincount(one.ravel(), every) / every.sum() == pytest.approx([0.7, 0.3], abs=2e-3)
+    found = np.bincount(other.ravel()[known], every[known])
+    assert found / found.sum() == pytest.approx([0.2, 0.5, 0.3], abs=2e-3)
+    unseen = raked([np.ones(10)], [([np.zeros(10, dtype=int)], np.array([0.5, 0.5]))])
+    assert unseen[0] == pytest.approx(np.ones(10)), "a state without frames gets none"
 
 
 def _states(frames: np.ndarray) -> np.ndarray:

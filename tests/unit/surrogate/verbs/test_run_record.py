@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 
 from surrogate import api
+from surrogate.comparison.answer import Answer, StateEnergy
 from surrogate.comparison.equivalent_time import EquivalentTime
-from surrogate.comparison.md_answer import Answer, StateEnergy
 from surrogate.verbs.options import RunOptions
 from surrogate.verbs.run.decision import Way, decide
 from surrogate.verbs.run.rates import Rates, Rolls
