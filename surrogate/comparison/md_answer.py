@@ -192,7 +192,7 @@ def md_answer(
         under_umbrella=md.differences_kj_mol is not None,
     )
     alike = surrogate is not None and math.isclose(surrogate.lag_ps, ps, rel_tol=1e-6)
-    if not alike or own is None or not answer.wants_surrogate or answer.has_images:
+    if not (alike or answer.under_umbrella) or own is None or not answer.wants_surrogate or answer.has_images:
         return answer
     with suppress(InputError):
         if answer.under_umbrella:

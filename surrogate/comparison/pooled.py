@@ -29,7 +29,7 @@ def pooled(
     labels: list[tuple[list[IntArray], FloatArray]] = []
     for name, of_md, names, _ in named:
         own = {k: told[name, state] for k, state in enumerate(names) if (name, state) in told}
-        both = _of_torsion(list(own.values()), temperature_k)
+        both = _of_torsion(list(own.values()), temperature_k, max(answer.energies[1], 1.0))
         states += both
         shares = np.zeros(len(names))
         shares[list(own)] = [s.share for s in both]
@@ -38,9 +38,13 @@ def pooled(
     return replace(answer, states=tuple(states), maps=maps(weights), weights=with_mean_one(weights))
 
 
-def _of_torsion(own: list[StateEnergy], temperature_k: float) -> list[StateEnergy]:
-    """Return the states of one torsion with both shares pooled."""
+def _of_torsion(own: list[StateEnergy], temperature_k: float, effective: float) -> list[StateEnergy]:
+    """Return the states of one torsion with both shares pooled; `effective`: frames of MD."""
     md, error = (np.array(x) for x in ([s.share for s in own], [s.error for s in own]))
+    # Replicas that never leave a state tell no error; as few frames as are effective leave this one, with one of either
+    # kind added (Laplace's rule).
+    likely = (md * effective + 1.0) / (effective + 2.0)
+    error = np.maximum(error, np.sqrt(likely * (1.0 - likely) / effective))
     rolled = np.array([s.surrogate or 0.0 for s in own])
     off = np.array([math.hypot(MODEL_ERROR, s.surrogate_error or 0.0) for s in own])
     known = np.array([not s.missing for s in own]) / error**2
@@ -49,12 +53,12 @@ def _of_torsion(own: list[StateEnergy], temperature_k: float) -> list[StateEnerg
     shares, errors = shares / shares.sum(), 1.0 / np.sqrt(counted)
     best, kt = int(shares.argmax()), GAS_CONSTANT_KJ_MOL_K * temperature_k
     found = []
-    for s, share, left in zip(own, shares.tolist(), errors.tolist(), strict=True):
+    for s, share, left, own_error in zip(own, shares.tolist(), errors.tolist(), error.tolist(), strict=True):
         energy = -kt * math.log(share / shares[best]) if share > 0 else None
         # Of the logarithm of a ratio.
         its = None if energy is None else kt * math.hypot(left / share, float(errors[best] / shares[best]))
         found.append(replace(s, share=share, error=left, free_energy_kj_mol=energy, free_energy_error=its,
-                             md_share=s.share, md_error=s.error))  # fmt: skip
+                             md_share=s.share, md_error=own_error))  # fmt: skip
     return found
 
 

@@ -56,6 +56,8 @@ _ANNEAL_PS, _ANNEAL = 50.0, 0.1
 _TORSION_MOVES = 3
 # Of MD's time goes into relaxing frames of a rollout to begin at; in less, fewer replicas begin apart, but so many.
 _STARTING, _LEAST_STARTS = 0.15, 4
+# Frames of MD under an umbrella potential count differently, so that it takes many.
+_WEIGHED_EVERY_PS = 1.0
 # Runs of one scene whose seeds differ by this are independent, replicas and all.
 _SEEDS_APART, _UMBRELLA_SEED = 10_000, 2
 # Of a run's report, where frames have weights.
@@ -151,7 +153,8 @@ def _simulate(site: Site, record: RunRecord, files: list[Path], name: Stage, see
 def _config(site: Site, record: RunRecord, name: Stage, seed: int) -> MDConfig:
     """Return the settings of a stage of MD: longer than it can be in its time."""
     rates, decision = _rates_and_decision(record)
-    every_ps = decision.save_every_ps
+    is_weighed = name == "umbrella md"
+    every_ps = min(decision.save_every_ps, _WEIGHED_EVERY_PS) if is_weighed else decision.save_every_ps
     expected_ps = md_ps(rates, decision, name) / rates.replicas
     return replace(
         site.config,
@@ -160,7 +163,7 @@ def _config(site: Site, record: RunRecord, name: Stage, seed: int) -> MDConfig:
         equilibrate_ps=min(site.config.equilibrate_ps, decision.equilibrate_ps),
         platform=rates.platform,
         seed=site.options.seed + seed * _SEEDS_APART,
-        umbrella=_umbrella(site, record) if name == "umbrella md" else None,
+        umbrella=_umbrella(site, record) if is_weighed else None,
     )
 
 

@@ -213,9 +213,9 @@ def test_few_of_it_and_a_surrogate_are_pooled_by_their_errors(forms: np.ndarray)
         assert both.is_joint and both.under_umbrella and not alone.is_joint
         errors.append((off(alone), off(both)))
         for s, a in zip(both.states, alone.states, strict=True):
-            rolled_error = math.hypot(MODEL_ERROR, s.surrogate_error or 0.0)
-            assert s.error == pytest.approx((a.error**-2 + rolled_error**-2) ** -0.5)
-            assert s.by_md == pytest.approx((a.share, a.error))
+            rolled_error, (share, own_error) = math.hypot(MODEL_ERROR, s.surrogate_error or 0.0), s.by_md
+            assert s.error == pytest.approx((own_error**-2 + rolled_error**-2) ** -0.5)
+            assert share == a.share and own_error >= max(a.error, 0.5 / math.sqrt(both.energies[1]) * math.sqrt(share))
         assert sum(s.share for s in both.states) == pytest.approx(1.0)
         weights, states = np.concatenate(both.weights), np.concatenate([_states(x) for x in md.segments])
         shares = np.bincount(states, weights, minlength=3) / weights.sum()
