@@ -3,15 +3,16 @@
     python docs/studies/training/peptide_transfer.py OUT.safetensors --train FOLDER [FOLDER ...] --budget 1h
                [--start WEIGHTS] [--tuned all|flow|states] [--coupled] [--runs 16] [--steps N] [--unseen 12] [--half]
     python docs/studies/training/peptide_transfer.py OUT.safetensors --train FOLDER [FOLDER ...] --start WEIGHTS
-               --tuned pace|populations
+               --tuned pace|populations|transfer
 
 FOLDER: `train` in a folder of `peptide_campaign` or `peptide_runs`, of each molecule in it the first `--runs`. `flow`
 and `states` train the flow or the probabilities of torsion states alone, and need `--start`. `--unseen`: every so many
 molecules of several residues one is left out, and the curves show its loss. `--half` rounds to float16 at the end. Free
 energies of φ > 0 are those of `peptide_energies` beside OUT, or those that the weights gone on from were trained with.
-A training that was stopped goes on. `pace` and `populations` train nothing: how often ψ changes its state beside other
-residues (`balance.set_pace`), or how likely states of ψ and side chains are (`balance.set_populations`, from runs under
-an umbrella potential), are set to what the runs show, in their solvent.
+A training that was stopped goes on. These train nothing: `transfer` gives another solvent the probabilities of the
+first, as often as its own have it (`balance.transfer`), in the mean over frames in it; `pace` sets how often ψ changes
+its state beside other residues to what runs show (`balance.set_pace`); `populations` sets how likely states of ψ and
+side chains are to what runs under an umbrella potential show (`balance.set_populations`).
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ from processes import is_trained
 
 from surrogate.data import FrameSets, Split, TrainingFrames, collect_frames
 from surrogate.models.architecture import weights_path
-from surrogate.models.peptides.balance import set_pace, set_populations
+from surrogate.models.peptides.balance import set_pace, set_populations, transfer
 from surrogate.models.peptides.layout import PeptideConfig, chain_features
 from surrogate.models.peptides.model import PeptideSlide
 from surrogate.models.peptides.subjects import PeptideSubject
@@ -43,7 +44,7 @@ _VALIDATE_S = 300.0
 # The end of each run that is held out has at least so many frames, more than a chunk.
 _HELD_FRAMES = 20
 # What is set to what runs show, without training.
-LEVELS = {"pace": set_pace, "populations": set_populations}
+LEVELS = {"pace": set_pace, "populations": set_populations, "transfer": transfer}
 
 
 def sets_of(folders: Sequence[Path], runs: int = 10_000, *, umbrella: bool = False) -> list[TrainingFrames]:

@@ -131,6 +131,46 @@ def set_pace(model: PeptideSlide, subjects: Sequence[PeptideSubject]) -> None:
 
 
 @torch.no_grad()
+def transfer(model: PeptideSlide, subjects: Sequence[PeptideSubject]) -> None:
+    """Give other solvents the probabilities of the first, changes as often as they have them: by one factor for every
+    two states of a kind of torsion, and for psi one more beside a residue before and one beside a residue after.
+    Little MD tells these factors, in the mean over frames of `subjects` in a solvent, and not what each type does."""
+    ends = _ends(model)
+    for solvent, jumps in enumerate(cast(list[StateJumps], list(model.all_jumps))):
+        some = [s for s in subjects if s.chain.solvent == solvent and solvent > 0]
+        if not some:
+            continue
+        wanted = [_paces(model, subject) for subject in some]
+        jumps.load_state_dict(model.jumps.state_dict())
+        for _ in range(_CHANGES_PASSES):
+            found: dict[tuple[int, int, int], list[tuple[list[float], float]]] = {}
+            for subject, own in zip(some, wanted, strict=True):
+                types = subject.chain.places[:, 1:3].tolist()
+                for (r, torsion, a, b), pace in _paces(model, subject).items():
+                    beside = [float(torsion == _PSI and kind not in ends) for kind in types[r]]
+                    found.setdefault((torsion, a, b), []).append(([1.0, *beside], own[r, torsion, a, b] - pace))
+            for (torsion, a, b), each in found.items():
+                parts, lacking = (torch.tensor(x).double() for x in zip(*each, strict=True))
+                held = parts.T @ parts + _RIDGE * torch.eye(3)
+                levels = (
+                    torch.linalg.solve(held, parts.T @ lacking).float()[:, None].repeat(1, jumps.of_change.shape[1])
+                )
+                levels[1:, ends] = 0.0
+                jumps.raise_change(torsion, a, b, levels.to(jumps.of_change.device))
+                jumps.raise_change(torsion, b, a, levels.to(jumps.of_change.device))
+
+
+def _paces(model: PeptideSlide, subject: PeptideSubject) -> dict[tuple[int, int, int, int], float]:
+    """Return the logarithm of how often each torsion of each residue changes between two states, by (residue, torsion,
+    state, state), either direction, from frames of a peptide evenly drawn."""
+    generator = torch.Generator().manual_seed(_SIDE_SEED)
+    idx = torch.randint(subject.frames.n_frames, (_FRAMES,), generator=generator)
+    flux, _, held = _fluxes(model, subject, idx, generator)
+    return {(r, k, a, b): float(flux[r, k, a, b] + flux[r, k, b, a]) / 2
+            for r, k, a, b in _pairs_of_states(subject, held, signs=True)}  # fmt: skip
+
+
+@torch.no_grad()
 def set_populations(model: PeptideSlide, subjects: Sequence[PeptideSubject]) -> None:
     """Move changes of psi and side chains, one direction against the other, to the populations of states that frames of
     `subjects` have, which do not run in time as molecules do: first by what residues beside others lack alike, on
@@ -236,12 +276,15 @@ def _step(subject: PeptideSubject) -> int:
     return max(1, round(_STEP_PS / subject.frames.lag_ps))
 
 
-def _pairs_of_states(subject: PeptideSubject, held: Tensor) -> list[tuple[int, int, int, int]]:
-    """Return residue, torsion and every two of its states that enough frames are in, but the signs of phi."""
+def _pairs_of_states(
+    subject: PeptideSubject, held: Tensor, *, signs: bool = False
+) -> list[tuple[int, int, int, int]]:  # fmt: skip
+    """Return residue, torsion and every two of its states that enough frames are in, with or without the signs of
+    phi."""
     counts = subject.chain.stated.counts
     return [
         (r, k, a, b)
-        for r, k in torch.nonzero(counts > 1).tolist() if k or r not in subject.chain.signed
+        for r, k in torch.nonzero(counts > 1).tolist() if k or signs or r not in subject.chain.signed
         for a, b in combinations(range(int(counts[r, k])), 2) if min(held[r, k, a], held[r, k, b]) >= _LEAST_FRAMES
     ]  # fmt: skip
 

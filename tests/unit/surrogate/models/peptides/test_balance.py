@@ -11,12 +11,14 @@ import torch
 from small_scenes import with_phi_turned
 from surrogate.data import TrainingFrames, canonicalise, quantise
 from surrogate.models.peptides.balance import (
+    _paces,
     balance,
     changes,
     lacking_entries,
     lacking_populations,
     set_pace,
     set_populations,
+    transfer,
     weighted_phis,
 )
 from surrogate.models.peptides.layout import PeptideConfig, chain_features
@@ -185,6 +187,35 @@ def change_of(jumps: torch.nn.Module, config: PeptideConfig, name: str) -> float
     """Both directions of psi of a residue together."""
     levels = jumps.of_change[0, 2 + config.types.index(name), 1]
     return float(levels[0, 1] + levels[1, 0])
+
+
+def test_a_solvent_takes_over_what_types_do_and_keeps_its_mean_pace() -> None:
+    config = PeptideConfig(width=16, n_layers=1, n_heads=1, chunk_frames=4, solvents=("obc2", "tip3p"))
+    names = ("ALA", "SER", "ALA-SER", "SER-ALA")
+    sets = [_frames(f"ACE-{name}-NME", kind="psi") for name in names]
+    config = with_scale(config, sets)
+    dry, wet = ([PeptideSubject(f, chain_features(f.scene, config, solvent), np.ones(2 * EACH)) for f in sets]
+                for solvent in ("obc2", "tip3p"))  # fmt: skip
+    torch.manual_seed(0)
+    model = PeptideSlide(config).requires_grad_(False)
+    for jumps, slower in ((model.jumps, 1.0), (model.jumps_elsewhere[0], 2.5)):
+        jumps.of_change[0, :, 1, :2, :2] = torch.randn(len(model.token_mean) // 2, 2, 2) - slower
+    start = {name: x.clone() for name, x in model.jumps.named_parameters()}
+
+    def paces(some: list[PeptideSubject]) -> np.ndarray:
+        return np.array([pace for s in some for (_, k, *_), pace in _paces(model, s).items() if k == 1])
+
+    def lacking(some: list[PeptideSubject]) -> np.ndarray:
+        return np.array([c.lacking for s in some for c in lacking_populations(model, s) if c.torsion == 1])
+
+    before, of_wet, of_dry = paces(wet), lacking(wet), lacking(dry)
+    assert abs((before - paces(dry)).mean()) > 0.7
+    transfer(model, wet)
+    assert paces(wet).mean() == pytest.approx(before.mean(), abs=0.1) and len(before) == 6
+    # What goes back and forth within 100 ps lacks less.
+    assert np.abs(lacking(wet) - of_dry).mean() < 0.4 * np.abs(of_wet - of_dry).mean(), "populations are the first's"
+    assert np.corrcoef(lacking(wet), of_dry)[0, 1] > 0.97
+    assert all(torch.equal(x, start[name]) for name, x in model.jumps.named_parameters())
 
 
 def test_how_far_populations_err_is_told_by_runs() -> None:
