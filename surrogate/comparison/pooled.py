@@ -6,6 +6,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 
@@ -15,6 +16,7 @@ from surrogate.comparison.measure.statistics import FloatArray, IntArray
 from systems.units import GAS_CONSTANT_KJ_MOL_K
 
 _SWEEPS, _SETTLED = 200, 1e-6
+_VISIT_FRAMES = 5
 
 
 def pooled(
@@ -29,7 +31,7 @@ def pooled(
     labels: list[tuple[list[IntArray], FloatArray]] = []
     for name, of_md, names, _ in named:
         own = {k: told[name, state] for k, state in enumerate(names) if (name, state) in told}
-        both = _of_torsion(list(own.values()), temperature_k, max(answer.energies[1], 1.0))
+        both = _of_torsion(list(own.values()), temperature_k, np.array([_crossings(of_md, k) for k in own]))
         states += both
         shares = np.zeros(len(names))
         shares[list(own)] = [s.share for s in both]
@@ -38,14 +40,14 @@ def pooled(
     return replace(answer, states=tuple(states), maps=maps(weights), weights=with_mean_one(weights))
 
 
-def _of_torsion(own: list[StateEnergy], temperature_k: float, effective: float) -> list[StateEnergy]:
-    """Return the states of one torsion with both shares pooled; `effective`: frames of MD."""
+def _of_torsion(own: list[StateEnergy], temperature_k: float, crossings: FloatArray) -> list[StateEnergy]:
+    """Return the states of one torsion with both shares pooled; `crossings` of MD into each, and out of it."""
     md, error = (np.array(x) for x in ([s.share for s in own], [s.error for s in own]))
-    # Replicas that never leave a state tell no error; as few frames as are effective leave this one, with one of either
-    # kind added (Laplace's rule).
-    likely = (md * effective + 1.0) / (effective + 2.0)
-    error = np.maximum(error, np.sqrt(likely * (1.0 - likely) / effective))
     rolled = np.array([s.surrogate or 0.0 for s in own])
+    # Replicas tell no error of a state that they hardly enter or leave: n crossings either way leave p (1 - p)
+    # sqrt(2 / n), whichever share is taken for p.
+    spread = np.maximum(md * (1.0 - md), rolled * (1.0 - rolled))
+    error = np.maximum(error, spread * np.sqrt(2.0 / np.maximum(crossings, 0.5)))
     off = np.array([math.hypot(MODEL_ERROR, s.surrogate_error or 0.0) for s in own])
     known = np.array([not s.missing for s in own]) / error**2
     counted = known + 1.0 / off**2
@@ -60,6 +62,17 @@ def _of_torsion(own: list[StateEnergy], temperature_k: float, effective: float) 
         found.append(replace(s, share=share, error=left, free_energy_kj_mol=energy, free_energy_error=its,
                              md_share=s.share, md_error=own_error))  # fmt: skip
     return found
+
+
+def _crossings(labels: Sequence[IntArray], state: int) -> float:
+    """Return how often replicas cross into a state, and out of it, in the mean, visits of a few frames left out."""
+    n = 0
+    for x in labels:
+        inside = x == state
+        ends = np.flatnonzero(np.diff(inside)) + 1
+        pieces = [piece for piece in np.split(inside, ends) if len(piece) >= _VISIT_FRAMES]
+        n += sum(bool(a[0] != b[0]) for a, b in pairwise(pieces))
+    return n / 2.0
 
 
 def raked(

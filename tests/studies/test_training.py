@@ -240,6 +240,30 @@ def test_what_is_trained_and_measured_in_water() -> None:
     assert peptide_water.with_error(lambda some: 10.0 * len(some) + 0.1 * (0 in some), 2) == "20.10 ± 0.05"
 
 
+def test_populations_are_of_weighted_frames_with_every_phi_negative() -> None:
+    turns = [Turn(kind, 0, (0, 1, 2, 3)) for kind in ("phi", "psi", "chi1")]
+    rows = [(-70, -40, 60), (-70, 140, -60), (60, -40, 180), (-160, -30, 170)]
+    run = np.radians(np.array(rows, dtype=np.float64))
+    found = peptide_water.shares_of(turns, ["SER"], [run, run], [np.array([1.0, 2.0, 5.0, 1.0])] * 2)
+    shares = {name: share for name, (share, _) in found.items()}
+    assert shares == pytest.approx({"ψ SER helix": 50.0, "ψ SER strand": 50.0, "χ1 SER gauche+": 25.0,
+                                    "χ1 SER trans": 25.0, "χ1 SER gauche-": 50.0})  # fmt: skip
+    assert all(error == pytest.approx(0.0, abs=1e-9) for _, error in found.values()), "both runs say the same"
+    one, other = (peptide_water.shares_of(turns, ["SER"], [run[[k, k, 1]] for k in some], [np.ones(3)] * 4)
+                  for some in ((0, 0, 1, 1), (0, 1, 0, 1)))  # fmt: skip
+    assert one == other and one["ψ SER helix"][1] > 10.0
+
+
+def test_pairs_under_an_umbrella_are_of_all_residues_and_no_test() -> None:
+    order = peptide_campaign.umbrella_order()
+    tests = [p.name for kind, p, _ in order if kind == "umbrella_test"]
+    pairs = [p for kind, p, _ in order if kind == "umbrella"]
+    assert tests == ["LEU-SER", "VAL-ASN"] and not set(tests) & {p.name for p in pairs}
+    first = [p.residues for p in pairs[: len(RESIDUES)]]
+    assert all(len({pair[place] for pair in first}) >= len(RESIDUES) - 1 for place in (0, 1))
+    assert {"LEU", "SER", "VAL", "ASN"} & set(first[0])
+
+
 def test_no_training_takes_what_is_tested_by(tmp_path: Path) -> None:
     for name in ("GLN-ILE", "free-GLN-ILE", "GLY-VAL"):
         (tmp_path / name / name).mkdir(parents=True)

@@ -173,8 +173,8 @@ def _paces(model: PeptideSlide, subject: PeptideSubject) -> dict[tuple[int, int,
 @torch.no_grad()
 def set_populations(model: PeptideSlide, subjects: Sequence[PeptideSubject]) -> None:
     """Move changes of psi and side chains, one direction against the other, to the populations of states that frames of
-    `subjects` have, which do not run in time as molecules do: first by what residues beside others lack alike, on
-    either side, then by what each type lacks beyond. Residues between caps keep their mean, and all keep their pace."""
+    `subjects` have, which do not run in time as molecules do: of psi first by what residues beside others lack alike,
+    on either side, then by what each type lacks beyond. Residues between caps keep their mean, and all their pace."""
     ends = _ends(model)
     for solvent, jumps in enumerate(cast(list[StateJumps], list(model.all_jumps))):
         some = [s for s in subjects if s.chain.solvent == solvent and s.weights is not None]
@@ -184,7 +184,9 @@ def set_populations(model: PeptideSlide, subjects: Sequence[PeptideSubject]) -> 
                 found.setdefault((change.torsion, *change.states), []).append(change)
             for (torsion, a, b), each in found.items():
                 has = F.one_hot(torch.tensor([c.types[0] for c in each]), jumps.of_change.shape[1]).double()
-                beside = torch.tensor([[kind not in ends for kind in c.types[1:]] for c in each]).double()
+                beside = torch.tensor(
+                    [[torsion == _PSI and kind not in ends for kind in c.types[1:]] for c in each]
+                ).double()
                 left = [max(-_MOST, min(c.lacking, _MOST)) for c in each]
                 common = _nearest(beside, each, left)
                 own = _nearest(has, each, (torch.tensor(left).double() - beside @ common.double()).tolist())
