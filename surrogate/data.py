@@ -104,7 +104,7 @@ class TrainingFrames:
     heavy atoms when `canonical`. `starts` holds the first frame of each trajectory and, last, n_frames. Frames that
     carry `velocities` (n_frames, n_atoms, 3) nm/ps have their centre of mass at the origin and at rest. `turn` (3, 3):
     applied to frames as they are read, where the scene has been posed anew since they were laid on it.
-    `differences_kj_mol` (n_frames,): of MD under an umbrella potential, how much lower frames lie without it.
+    `differences_kj_mol` (n_frames,): of MD under an umbrella potential, energies without it, less those with it.
     """
 
     scene: Scene

@@ -307,19 +307,21 @@ def stated_error(answer: dict[str, Any]) -> float:
     return 100.0 * math.sqrt(float(np.mean(np.square(errors)))) if errors else math.nan
 
 
+def same_state(a: str, b: str) -> bool:
+    """Return whether two names are of the same state of a torsion: wells are where their means are within 30
+    degrees."""
+    x, y = (re.fullmatch(r"(-?\d+)°", s) for s in (a, b))
+    if x is None or y is None:
+        return a == b
+    return abs((float(x[1]) - float(y[1]) + 180.0) % 360.0 - 180.0) < 30.0
+
+
 def intervals_held(told: dict[str, Any], ref: Answer) -> tuple[int, int]:
-    """Return how many 95 % intervals of populations in a run's equilibrium.json hold the reference's, and of how many;
-    wells of torsions are the same where their means are within 30 degrees."""
-
-    def same(a: str, b: str) -> bool:
-        x, y = (re.fullmatch(r"(-?\d+)°", s) for s in (a, b))
-        if x is None or y is None:
-            return a == b
-        return abs((float(x[1]) - float(y[1]) + 180.0) % 360.0 - 180.0) < 30.0
-
+    """Return how many 95 % intervals of populations in a run's equilibrium.json hold the reference's, and of how
+    many."""
     held = total = 0
     for state in told.get("states", ()):
-        right = [s for s in ref.states if s.torsion == state["torsion"] and same(s.state, state["state"])]
+        right = [s for s in ref.states if s.torsion == state["torsion"] and same_state(s.state, state["state"])]
         if state["missing"] or len(right) != 1:
             continue
         total += 1

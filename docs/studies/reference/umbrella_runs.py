@@ -15,10 +15,9 @@ import math
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from error_against_minutes import answer_again
+from error_against_minutes import answer_again, same_state
 
 from md_reference.run.machine import machine_name
 from surrogate.comparison.answer import StateEnergy
@@ -28,40 +27,24 @@ from surrogate.verbs.run.run_record import RunResult
 
 TABLES = Path(__file__).parents[2] / "results" / "tables"
 COLUMNS = ["run", "populations by", "ψ", "side chains", "all", "stated"]
-# Wells of one torsion are the same where their middles are nearer.
-NEAR_DEG = 30.0
-
-
-def counterpart(state: dict[str, Any], reference: Sequence[StateEnergy]) -> StateEnergy | None:
-    """Return the same state of a reference, None where it has none."""
-    for s in reference:
-        if s.torsion != state["torsion"]:
-            continue
-        if s.state == state["state"]:
-            return s
-        if s.state.endswith("°") and state["state"].endswith("°"):
-            apart = abs((float(s.state[:-1]) - float(state["state"][:-1]) + 180.0) % 360.0 - 180.0)
-            if apart < NEAR_DEG:
-                return s
-    return None
 
 
 def row(folder: Path, reference: Sequence[StateEnergy]) -> list[str]:
     """Return a line of the table."""
     answer = answer_again(RunResult.of(folder), None)
     assert answer is not None
-    told = answer.to_dict()
-    found = [(s, r) for s in told["states"] if s["state"] != "left-handed" and (r := counterpart(s, reference))]
+    found = [(s, r) for s in answer.states for r in reference
+             if s.state != "left-handed" and s.torsion == r.torsion and same_state(s.state, r.state)]  # fmt: skip
 
-    def error(some: Sequence[tuple[dict[str, Any], StateEnergy]]) -> str:
-        square = float(np.mean([(s["share"] - r.share) ** 2 - r.error**2 for s, r in some]))
+    def error(some: Sequence[tuple[StateEnergy, StateEnergy]]) -> str:
+        square = float(np.mean([(s.share - r.share) ** 2 - r.error**2 for s, r in some]))
         return f"{100.0 * math.sqrt(max(0.0, square)):.1f}"
 
-    side = [each for each in found if each[0]["torsion"].startswith("χ")]
+    side = [each for each in found if each[0].torsion.startswith("χ")]
     psi = [each for each in found if each not in side]
-    stated = 100.0 * math.sqrt(float(np.mean([s["error"] ** 2 for s, _ in found])))
+    stated = 100.0 * math.sqrt(float(np.mean([s.error**2 for s, _ in found])))
     words = f"{folder.name}, {folder.parent.name}"
-    return [words, told["populations_by"], error(psi), error(side), error(found), f"{stated:.1f}"]
+    return [words, answer.to_dict()["populations_by"], error(psi), error(side), error(found), f"{stated:.1f}"]
 
 
 def main() -> None:

@@ -14,8 +14,8 @@ the rest of pairs with every residue once at either place, further tests, pairs 
 is there is left alone and what was stopped goes on.
 
 `--umbrella`: capped pairs in water under an umbrella potential of psi and side chains, which MD in OBC2 of 1.2 ns a
-replica tells, from its frames with phi < 0: `FOLDER/umbrella/NAME`, those of tests in `umbrella_test`. Populations of
-torsion states take a fifth of the time to know, side chains far less; nothing is told of how fast they turn.
+replica tells, from its frames with phi < 0: `FOLDER/umbrella/NAME`, those of tests in `umbrella_test`. They are
+for populations of torsion states, not for rates.
 """
 
 from __future__ import annotations
@@ -223,6 +223,8 @@ SWITCHES = {
 
 def main(arguments: Sequence[str] | None = None) -> None:
     chosen = arguments_of(__doc__, SWITCHES, arguments, solvents=SAVED_PS)
+    if chosen.umbrella and chosen.solvent != WATER.solvent:
+        raise SystemExit("--umbrella is for water; leave --solvent out.")
     tasks = umbrella_order if chosen.umbrella else partial(order, chosen.solvent)
     if chosen.list:
         for kind, peptide, number in tasks():

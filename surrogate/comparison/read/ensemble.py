@@ -95,8 +95,8 @@ class Ensemble(InSegments):
     `flags` `(n,)` uint16 and `chunk_idx` `(n,)` int32 per segment, or None where the file does not say; `record`: what
     the writer said of itself (costs summed over files); `sources`: the files; `top`, `stated_lag_ps`: what the user
     said of them; `notes`: what was done on reading; `grids_nm`: what the coordinates of each segment are rounded to, 0
-    for nothing (none given: nothing); `differences_kj_mol`: of MD under an umbrella potential, how much lower each
-    frame lies without it.
+    for nothing (none given: nothing); `differences_kj_mol`: of MD under an umbrella potential, the energy of each
+    frame without it, less that with it.
     Raises InputError for shapes that do not fit, no frame at all, or a lag that is not positive.
     """
 
@@ -261,7 +261,7 @@ def load_ensemble(
 
 
 def _of_umbrella(reader: TrajectoryReader) -> FloatArray | None:
-    """Return how much lower frames `(n,)` of MD under an umbrella potential lie without it; else None."""
+    """Return the energy of frames `(n,)` without their umbrella potential, less that with it; None without one."""
     return reader.scalars.get(DIFFERENCE_COLUMN) if reader.record.get("umbrella") else None
 
 

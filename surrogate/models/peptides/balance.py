@@ -199,7 +199,7 @@ def set_populations(model: PeptideSlide, subjects: Sequence[PeptideSubject]) -> 
 @torch.no_grad()
 def lacking_populations(model: PeptideSlide, subject: PeptideSubject) -> list[Change]:
     """Return every two states of a peptide's torsions, but the signs of phi, that enough of its frames are in, drawn by
-    their weights; how far what is lacking errs is told by its runs, left out one after the other."""
+    their weights, with the jackknife variance over its runs."""
     assert subject.weights is not None
     generator = torch.Generator().manual_seed(_SIDE_SEED)
     idx = torch.multinomial(torch.from_numpy(subject.weights), _FRAMES, True, generator=generator)
@@ -261,9 +261,9 @@ def changes(model: PeptideSlide, subject: PeptideSubject) -> list[Change]:
         return []
     flux, shares, held = _fluxes(model, subject, idx, generator)
     both = torch.zeros(2, *flux.shape)
+    is_now = F.one_hot(subject.states(idx), chains.MOST_STATES).float()
     for k, ours in zip(_STEPS, shares, strict=True):
         then = F.one_hot(subject.states(idx + _step(subject) * k), chains.MOST_STATES).float()
-        is_now = F.one_hot(subject.states(idx), chains.MOST_STATES).float()
         fluxes = torch.stack([torch.einsum("nrka,nrkb->rkab", is_now, later) for later in (ours, then)])
         both += ends_to_end * _STEPS[-1] / k / _FRAMES / len(_STEPS) * (fluxes + fluxes.mT)
     types, found = subject.chain.places[:, :3].tolist(), []

@@ -93,12 +93,14 @@ class Decision:
 
 
 def decide(
-    rates: Rates, budget_s: float, way: str = "auto", *, save_every_ps: float | None = None, whole_s: float = 0.0
-) -> Decision:
+    rates: Rates, budget_s: float, way: str = "auto", *, save_every_ps: float | None = None, whole_s: float = 0.0,
+    umbrella: bool = True,
+) -> Decision:  # fmt: skip
     """Return how `budget_s` (what is left of it, in s of wall time) is spent; `way`: md, surrogate or auto.
 
     `whole_s`: the budget that was asked for, of which measuring has taken some seconds already; it decides whether a
-    potential has time to learn, so that the least budget that is named is enough when it is given.
+    potential has time to learn, so that the least budget that is named is enough when it is given. `umbrella`: whether
+    MD in explicit water may run under one; a run that goes on keeps the stages that it has begun.
 
     Raises InputError for a budget in which nothing can be evaluated.
     """
@@ -118,7 +120,7 @@ def decide(
     comparison_s = min(comparison_s, 2.0 * (at_all_s + n_frames * of_frame_s))
     most = int(min(_MOST_FRAMES, max(_LEAST_FRAMES, (comparison_s - at_all_s) / of_frame_s)))
     left_s = budget_s - comparison_s
-    shares = _shares(rates, chosen, budget_s, left_s)
+    shares = _shares(rates, chosen, budget_s, left_s, umbrella=umbrella)
     stages = [PlannedStage(name, left_s * share) for name, share in shares.items()]
     found = Decision(chosen, why, (*stages, PlannedStage("report", comparison_s)), 0.0, 0.0, 0.0, 0.0)
     md = [md_ps(rates, found, name) for name in shares if name in ALL_MD_STAGES]
@@ -132,7 +134,7 @@ def decide(
     )
 
 
-def _shares(rates: Rates, way: Way, budget_s: float, left_s: float) -> dict[Stage, float]:
+def _shares(rates: Rates, way: Way, budget_s: float, left_s: float, *, umbrella: bool) -> dict[Stage, float]:
     """Return the shares of what the report leaves."""
     if way == "md" and rates.replicas == 1:
         return _BY_STAGES
@@ -145,7 +147,7 @@ def _shares(rates: Rates, way: Way, budget_s: float, left_s: float) -> dict[Stag
         return {**found, "held-out md": beside} if beside else found
     rolled = min(reversed(_ROLLED), key=lambda share: expected_errors(rates, budget_s, rolled=(share,))[_TOGETHER])
     own = 1.0 - rolled
-    weighs = _UMBRELLA * own if rates.explicit and rates.at_once > 1 else 0.0
+    weighs = _UMBRELLA * own if umbrella and rates.explicit and rates.at_once > 1 else 0.0
     if weighs * left_s <= _UMBRELLA_BEGINS * rates.begins_s:
         return {"rollout": rolled, "held-out md": own}
     return {"rollout": rolled, "umbrella md": weighs, "held-out md": own - weighs}

@@ -311,7 +311,10 @@ def _taken_up(record: RunRecord, options: RunOptions) -> RunRecord:
     if record.rates is None or record.decision is None or options.budget_s <= before_s:
         return record
     way = "md" if record.decision.way == "md" else "surrogate"
-    longer = decide(record.rates, options.budget_s, way, save_every_ps=record.decision.save_every_ps)
+    longer = decide(
+        record.rates, options.budget_s, way, save_every_ps=record.decision.save_every_ps,
+        umbrella=record.decision.seconds("umbrella md") > 0.0,
+    )  # fmt: skip
     if longer.way != record.decision.way:  # a surrogate that failed
         return record
     decision = replace(longer, why=record.decision.why, equilibrate_ps=record.decision.equilibrate_ps)

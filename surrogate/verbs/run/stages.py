@@ -211,12 +211,6 @@ def _starts(
     from md_reference.run.starts import HOT_PS, frames_as_starts, many_starts
 
     rates, decision = _rates_and_decision(record)
-    if record.umbrella and name == "held-out md" and rates.at_once > 1:
-        left_nm = where_left(site.scene, _config(site, record, "umbrella md", _UMBRELLA_SEED),
-                             _umbrella_files(site, record))  # fmt: skip
-        if len(left_nm):
-            scenes = [replace(site.scene, positions_nm=left_nm[k % len(left_nm)]) for k in range(len(files))]
-            return scenes, replace(config, starts="rollout")
     if config.starts == "one" or len(files) < 2:
         return site.scene, config
     rolled = None
@@ -228,6 +222,11 @@ def _starts(
         config = replace(config, starts="rollout", equilibrate_ps=left_out_ps)
     if all(path.exists() or checkpoint_path(path).exists() for path in files):
         return site.scene, config
+    if record.umbrella and name == "held-out md" and rates.at_once > 1:
+        left_nm = where_left(site.scene, _config(site, record, "umbrella md", _UMBRELLA_SEED),
+                             _umbrella_files(site, record))  # fmt: skip
+        if len(left_nm):
+            return [replace(site.scene, positions_nm=left_nm[k % len(left_nm)]) for k in range(len(files))], config
     if rolled is not None:
         with suppress(SimulationError):
             frames = frames_over_states(rolled, 2 * len(files), seed=site.options.seed)

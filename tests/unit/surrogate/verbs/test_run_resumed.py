@@ -189,6 +189,25 @@ def test_md_under_an_umbrella_gives_the_answer_and_the_starts_of_held_out_md(
     assert weights.std() > 0.1 and weights.mean() == pytest.approx(1.0)
 
 
+@needs_compiler
+def test_a_run_in_water_goes_on_with_the_stages_that_it_began_with(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its held-out MD could not become shorter, as it would be beside MD under an umbrella."""
+    monkeypatch.setattr(one_scene, "measure", lambda *_: WET)
+    monkeypatch.setattr(one_scene, "decide", lambda rates, left_s, *how, whole_s=0.0, **more:
+                        decide(rates, whole_s or left_s, *how, **more))  # fmt: skip
+    monkeypatch.setitem(stages.STAGES, "report", replace(stages.STAGES["report"], work=evaluated_at_once))
+    short_s, long_s = 320.0, 350.0
+    assert decide(WET, long_s, "surrogate").seconds("umbrella md") > 0.0
+    options: dict[str, Any] = {"way": "surrogate", "quiet": True}
+    first = api.run("alanine-dipeptide", tmp_path / "a", budget_s=short_s, **options)
+    names = ["rollout", "held-out md", "report"]
+    assert [stage["name"] for stage in first["stages"]] == names
+    went_on = api.run("alanine-dipeptide", tmp_path / "a", budget_s=long_s, resume=True, **options)
+    assert ended(went_on) == [(name, "done") for name in names] and not went_on["umbrella"]
+
+
 def ended_by_the_clock(stage: Callable[[], Any]) -> Any:
     try:
         return stage()
