@@ -25,7 +25,7 @@ from systems.files.schema import built, parsed
 from systems.files.whole_file import create_whole
 from systems.scene import Scene
 from systems.trajectory.base import TrajectoryReader, uneven_by_ps
-from systems.trajectory.codec import DIFFERENCE_COLUMN, open_trajectory
+from systems.trajectory.codec import open_trajectory
 from systems.trajectory.joined import refuse_joined
 from systems.trajectory.store import open_hdf5
 
@@ -104,7 +104,6 @@ class TrainingFrames:
     heavy atoms when `canonical`. `starts` holds the first frame of each trajectory and, last, n_frames. Frames that
     carry `velocities` (n_frames, n_atoms, 3) nm/ps have their centre of mass at the origin and at rest. `turn` (3, 3):
     applied to frames as they are read, where the scene has been posed anew since they were laid on it.
-    `differences_kj_mol` (n_frames,): of MD under an umbrella potential, energies without it, less those with it.
     """
 
     scene: Scene
@@ -117,7 +116,6 @@ class TrainingFrames:
     velocities: npt.NDArray[np.float32] | None = None
     split: Split = field(default_factory=Split)
     turn: npt.NDArray[np.float64] | None = None
-    differences_kj_mol: npt.NDArray[np.float64] | None = None
 
     @property
     def n_frames(self) -> int:
@@ -251,7 +249,7 @@ def is_windows(path: Path) -> bool:
 
 def collect_frames(
     paths: Sequence[Path], *, canonical: bool = True, velocities: bool = False, held: Sequence[Path] = (),
-    memory_bytes: int = MEMORY_BYTES, spool: Path | None = None, umbrella: bool = False,
+    memory_bytes: int = MEMORY_BYTES, spool: Path | None = None,
 ) -> TrainingFrames:  # fmt: skip
     """Read reference trajectories of one scene. Raises InputError when scenes, save intervals or conditions differ.
 
@@ -259,8 +257,8 @@ def collect_frames(
     `held`: trajectories that are held out whole; without any, the end of each is. More than `memory_bytes` of frames
     are kept in a nameless file in the folder `spool`, mapped, which goes when the process does. `sources` name each
     file's frames by digests: `sha256` of them as they were laid, which hangs on the first file of all, and
-    `shape_sha256` of their distances from the first atom, which does not. `umbrella`: they are of MD under an umbrella
-    potential, from which no motion can be learned; without it such MD is refused.
+    `shape_sha256` of their distances from the first atom, which does not. MD under an umbrella potential, from
+    which no motion can be learned, is refused.
     """
     if velocities and canonical:
         raise InputError("frames with velocities keep their own pose; they cannot be canonical as well.")
@@ -271,15 +269,11 @@ def collect_frames(
     kept = folder if shape[0] * shape[1] * (18 if velocities else 6) > memory_bytes else None
     coordinates = _room(shape, np.int16, kept)
     moving = _room(shape, np.float32, kept) if velocities else None
-    sources, differences = [], []
+    sources = []
     for path, begin in zip(files, starts[:-1].tolist(), strict=True):
         with open_trajectory(path) as reader:
-            if bool(reader.record.get("umbrella")) != umbrella:
-                what = "without" if umbrella else "under"
-                raise InputError(
-                    f"{path} was made {what} an umbrella potential, unlike what is learned from; leave it out."
-                )
-            differences.append(reader.scalars[DIFFERENCE_COLUMN] if umbrella else np.zeros(0))
+            if reader.record.get("umbrella"):
+                raise InputError(f"{path} was made under an umbrella potential, which tells no motion; leave it out.")
             digest, shape_digest, at = hashlib.sha256(), hashlib.sha256(), begin
             for frames in reader.iter_blocks(_BLOCK):
                 block = slice(at, at + len(frames))
@@ -301,8 +295,7 @@ def collect_frames(
                             "topology": scene.topology_hash, "sha256": digest.hexdigest()[:16],
                             "shape_sha256": shape_digest.hexdigest()[:16]})  # fmt: skip
     split = Split(held=tuple(range(len(paths), len(files))))
-    return TrainingFrames(scene, coordinates, starts, lag_ps, canonical, conditions, tuple(sources), moving, split,
-                          differences_kj_mol=np.concatenate(differences) if umbrella else None)  # fmt: skip
+    return TrainingFrames(scene, coordinates, starts, lag_ps, canonical, conditions, tuple(sources), moving, split)
 
 
 def _agreed(paths: list[Path]) -> tuple[Scene, float, dict[str, Any], npt.NDArray[np.int64]]:

@@ -12,12 +12,14 @@ import lag_errors
 import numpy as np
 import peptide_campaign
 import peptide_correction
+import peptide_populations
 import peptide_runs
 import peptide_seeds
 import peptide_transfer
 import peptide_unseen
 import peptide_water
 import pytest
+import torch
 from peptide_correction import CELLS, Correction
 from peptide_energies import wham
 from peptide_list import (
@@ -33,7 +35,14 @@ from peptide_list import (
 )
 from peptide_scores import Turn, psi_crossings
 
+from small_scenes import beyond, rotated, with_phi_turned
 from surrogate.comparison.rows.published_metrics import TABLE
+from surrogate.models.architecture import weights_path
+from surrogate.models.peptides.balance import Change
+from surrogate.models.peptides.layout import chain_features
+from surrogate.models.peptides.model import PeptideSlide
+from surrogate.models.weights import Weights, load_weights
+from systems.chemistry.geometry import torsion
 from systems.errors import InputError
 from systems.prepare.peptide import build_peptide
 from systems.trajectory.codec import open_trajectory
@@ -240,22 +249,55 @@ def test_what_is_trained_and_measured_in_water() -> None:
     assert peptide_water.with_error(lambda some: 10.0 * len(some) + 0.1 * (0 in some), 2) == "20.10 ± 0.05"
 
 
-def test_populations_are_of_weighted_frames_with_every_phi_negative() -> None:
-    turns = [Turn(kind, 0, (0, 1, 2, 3)) for kind in ("phi", "psi", "chi1")]
-    rows = [(-70, -40, 60), (-70, 140, -60), (60, -40, 180), (-160, -30, 170)]
-    run = np.radians(np.array(rows, dtype=np.float64))
-    found = peptide_water.shares_of(turns, ["SER"], [run, run], [np.array([1.0, 2.0, 5.0, 1.0])] * 2)
-    shares = {name: share for name, (share, _) in found.items()}
-    assert shares == pytest.approx({"ψ SER helix": 50.0, "ψ SER strand": 50.0, "χ1 SER gauche+": 25.0,
-                                    "χ1 SER trans": 25.0, "χ1 SER gauche-": 50.0})  # fmt: skip
-    assert all(error == pytest.approx(0.0, abs=1e-9) for _, error in found.values()), "both runs say the same"
-    one, other = (peptide_water.shares_of(turns, ["SER"], [run[[k, k, 1]] for k in some], [np.ones(3)] * 4)
-                  for some in ((0, 0, 1, 1), (0, 1, 0, 1)))  # fmt: skip
-    assert one == other and one["ψ SER helix"][1] > 10.0
+def test_populations_are_of_weighted_frames_with_every_phi_negative_wherever_runs_begin() -> None:
+    """Threonine's, whose chi1 the model tells by another atom."""
+    scene = build_peptide("ACE-THR-NME")
+    model = load_weights(weights_path("peptides")).model
+    assert isinstance(model, PeptideSlide)
+    chain = chain_features(scene, model.config)
+    atoms = [scene.atom_names.index(name) for name in ("N", "CA", "CB", "OG1")]
+    wanted = np.radians([60.0, 180.0, 300.0]) - torsion(scene.positions_nm[None], [atoms])[0, 0]
+    side = beyond(scene, atoms[1], atoms[2])
+    forms = [rotated(scene.positions_nm, side, (atoms[1], atoms[2]), turn) for turn in wanted]
+    left_handed = [with_phi_turned(replace(scene, positions_nm=x)) for x in forms]
+    rng, hops = np.random.default_rng(0), np.array([[0.9, 0.1, 0.0], [0.05, 0.9, 0.05], [0.0, 0.1, 0.9]])
+    orders = np.zeros((40, 31), dtype=int)  # all begin in the first; in equilibrium it has a quarter, the next a half
+    for k in range(30):
+        orders[:, k + 1] = [rng.choice(3, p=hops[x]) for x in orders[:, k]]
+    runs = [np.stack([*(forms[x] for x in order), left_handed[order[-1]]]) for order in orders]
+    factors = [np.array([*(order == 2) + 1.0, 1e3]) for order in orders]
+    found = peptide_populations.populations(scene, chain, runs, factors)
+    assert set(found) == {(1, "ψ"), (1, "χ1")}, "states of methyl groups are alike"
+    psi, (shares, errors) = found[1, "ψ"][0], found[1, "χ1"]
+    assert psi == pytest.approx([1.0, 0.0]), "the structure as built is a strand"
+    assert (orders == 0).mean() > 0.4 and 0.02 < errors.max() < 0.1
+    assert shares == pytest.approx([0.2, 0.4, 0.4], abs=0.08), "gauche+, trans, gauche-, which counts twice"
 
 
-def test_pairs_under_an_umbrella_are_of_all_residues_and_no_test() -> None:
+def test_batches_of_populations_are_taken_together(tmp_path: Path) -> None:
+    record = tmp_path / "record.tsv"
+    lines = ["\t".join(peptide_populations.COLUMNS), "ALA-SER\t0\t3\t2\tχ1\t50.0 30.0 20.0\t10.0 8.0 6.0",
+             "ALA-SER\t1\t1\t2\tχ1\t10.0 50.0 40.0\t10.0 8.0 6.0"]  # fmt: skip
+    record.write_text("\n".join(lines), "utf-8")
+    rows = peptide_populations.read(record)
+    (both,) = peptide_populations.together(rows)
+    assert both.at == (2, "χ1") and both.ns == 4.0
+    assert both.shares == pytest.approx([0.4, 0.35, 0.25])
+    assert both.errors == pytest.approx(np.array([0.1, 0.08, 0.06]) * math.sqrt(10.0) / 4.0)
+    # As many independent frames as err as much: of a half, 10 % is 25.
+    half = rows[0]._replace(shares=np.array([0.5, 0.5]), errors=np.array([0.1, 0.1]))
+    assert half.counted == pytest.approx(25.0) and half.variance(0, 1) == pytest.approx(2.0 / 13.0)
+    assert half.log_ratio(np.array([1.0, 0.0]), 0, 1) == pytest.approx(math.log(0.5 / 25.5))
+
+
+def test_pairs_under_an_umbrella_are_of_all_residues_and_no_test(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(peptide_campaign, "recorded", lambda: {("LEU-SER", 0), ("TRP-SER", 0), ("TRP-SER", 1)})
     order = peptide_campaign.umbrella_order()
+    again = [(p.name, number) for _, p, number in order]
+    assert ("VAL-ASN", 0) in again and not {("LEU-SER", 0), ("TRP-SER", 0), ("TRP-SER", 1)} & {*again}
+    assert {("LEU-SER", 1), ("TRP-SER", 2)} <= {*again}
+    monkeypatch.setattr(peptide_campaign, "recorded", set)
+    order = [(kind, p, number) for kind, p, number in peptide_campaign.umbrella_order() if number == 0]
     tests = [p.name for kind, p, _ in order if kind == "umbrella_test"]
     pairs = [p for kind, p, _ in order if kind == "umbrella"]
     assert tests == ["LEU-SER", "VAL-ASN"] and not set(tests) & {p.name for p in pairs}
@@ -293,3 +335,33 @@ def test_a_correction_weighs_frames_by_their_residues_maps(monkeypatch: pytest.M
     found = Correction.of(tmp_path / "there", tmp_path / "here")
     assert found.clock == 1.5 and found.log_ratio.keys() == {"ALA"}
     assert found.log_ratio["ALA"] == pytest.approx(np.ones((CELLS, CELLS)))
+
+
+def test_populations_are_set_once_however_many_passes(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """Rollouts are taken to lack what is given less what levels have added."""
+    start = load_weights(weights_path("peptides"))
+    model = start.model
+    assert isinstance(model, PeptideSlide)
+    kind = 2 + model.config.types.index("SER")
+    dry, wet = ({name: x.clone() for name, x in jumps.state_dict().items()} for jumps in model.all_jumps)
+
+    def lacking(weights: Weights, torsions: object, folder: Path) -> dict[str, list[Change]]:
+        of = model.all_jumps[1].state_dict()["of_change"] - wet["of_change"]
+        added = float(of[0, kind, 2, 0, 1] - of[0, kind, 2, 1, 0])
+        return {"ALA-SER": [Change((kind, kind, kind), 2, (0, 1), 1.0 - added, 0.4)]}
+
+    torsion = peptide_populations.Torsion("TYR-CYS", "", 3.0, 1, "ψ", np.array([0.5, 0.5]), np.array([0.1, 0.1]))
+    monkeypatch.setattr(peptide_populations, "lacking", lacking)
+    monkeypatch.setattr(peptide_populations, "learned", lambda: [torsion])
+    peptide_populations.set_populations(tmp_path / "out.safetensors", start)
+    found = load_weights(tmp_path / "out.safetensors")
+    assert isinstance(found.model, PeptideSlide)
+    moved = found.model.all_jumps[1].state_dict()["of_change"][0] - wet["of_change"][0]
+    # N(1, 0.4 + 0.1) beside N(0, 0.5), half of it either way; weights are kept as float16.
+    assert moved[kind, 2, 0, 1] == pytest.approx(0.25, abs=0.01) and moved[kind, 2, 1, 0] == pytest.approx(
+        -0.25, abs=0.01
+    )
+    assert all(torch.equal(x, dry[name]) for name, x in found.model.all_jumps[0].state_dict().items())
+    of_tip3p = [m for m in found.domain.members if m.conditions["solvent"] == "tip3p"]
+    assert sum("ACE-TYR-CYS-NME" in member.sequences for member in of_tip3p) == 1
+    assert {*start.domain.names} < {*found.domain.names} and found.provenance["umbrella_ns"] == 3.0

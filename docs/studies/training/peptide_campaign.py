@@ -15,7 +15,7 @@ is there is left alone and what was stopped goes on.
 
 `--umbrella`: capped pairs in water under an umbrella potential of psi and side chains, which MD in OBC2 of 1.2 ns a
 replica tells, from its frames with phi < 0: `FOLDER/umbrella/NAME`, those of tests in `umbrella_test`. They are
-for populations of torsion states, not for rates.
+for populations of torsion states, not for rates; what `peptide_populations` holds already is left out.
 """
 
 from __future__ import annotations
@@ -38,6 +38,7 @@ from peptide_list import (
     unseen_peptides,
     wide_peptides,
 )
+from peptide_populations import recorded
 from processes import arguments_of, in_order, only_here, parts_of, run_path, simulate_runs
 
 from md_reference.forces.forcefield import build_system
@@ -199,13 +200,16 @@ def order(solvent: str) -> list[tuple[str, Peptide, int]]:
 
 def umbrella_order() -> list[tuple[str, Peptide, int]]:
     """Return the same of batches under an umbrella potential: the tests that are pairs, then pairs with every residue
-    once at either place, those of the tests' residues first, then the rest."""
+    once at either place, those of the tests' residues first, then the rest; and again."""
     tests = [replace(p, time_ps=UMBRELLA_TEST_PS) for p in TEST if p.capped]
     named = {residue for p in tests for residue in p.residues}
     pairs = [p for kind, p, number in order(WATER.solvent) if (kind, number) == ("train", 0) and p.capped]
     pairs = [replace(p, time_ps=UMBRELLA_PS) for p in pairs if len(p.residues) == 2]
     pairs[: len(RESIDUES)] = sorted(pairs[: len(RESIDUES)], key=lambda p: not named & set(p.residues))
-    return [*(("umbrella_test", p, 0) for p in tests), *(("umbrella", p, 0) for p in pairs)]
+    kinds = (("umbrella_test", tests), ("umbrella", pairs))
+    known = recorded()
+    return [(kind, p, number) for number in range(ROUNDS) for kind, some in kinds for p in some
+            if (p.name, number) not in known]  # fmt: skip
 
 
 def make(task: tuple[str, Peptide, int], deadline: float, folder: str, solvent: str) -> None:

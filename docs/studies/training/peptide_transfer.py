@@ -3,7 +3,7 @@
     python docs/studies/training/peptide_transfer.py OUT.safetensors --train FOLDER [FOLDER ...] --budget 1h
                [--start WEIGHTS] [--tuned all|flow|states] [--coupled] [--runs 16] [--steps N] [--unseen 12] [--half]
     python docs/studies/training/peptide_transfer.py OUT.safetensors --train FOLDER [FOLDER ...] --start WEIGHTS
-               --tuned pace|populations
+               --tuned pace
     python docs/studies/training/peptide_transfer.py OUT.safetensors --start WEIGHTS --tuned transfer
 
 FOLDER: `train` in a folder of `peptide_campaign` or `peptide_runs`, of each molecule in it the first `--runs`. `flow`
@@ -12,8 +12,7 @@ molecules of several residues one is left out, and the curves show its loss. `--
 energies of φ > 0 are those of `peptide_energies` beside OUT, or those that the weights gone on from were trained with.
 A training that was stopped goes on. These train nothing: `transfer` gives TIP3P the probabilities of OBC2, as often as
 its own have it (`balance.transfer`), in the mean over rollouts in it, which lie beside OUT; `pace` sets how often ψ
-changes its state beside other residues to what runs show (`balance.set_pace`); `populations` sets how likely states of
-ψ and side chains are to what runs under an umbrella potential show (`balance.set_populations`).
+changes its state beside other residues to what runs show (`balance.set_pace`). Populations: `peptide_populations`.
 """
 
 from __future__ import annotations
@@ -33,7 +32,7 @@ from processes import is_trained
 
 from surrogate.data import FrameSets, Split, TrainingFrames, collect_frames
 from surrogate.models.architecture import weights_path
-from surrogate.models.peptides.balance import set_pace, set_populations, transfer
+from surrogate.models.peptides.balance import set_pace, transfer
 from surrogate.models.peptides.layout import PeptideConfig, chain_features
 from surrogate.models.peptides.model import PeptideSlide
 from surrogate.models.peptides.subjects import PeptideSubject
@@ -51,19 +50,19 @@ _HELD_FRAMES = 20
 TIP3P, _ROLLOUTS = "tip3p", 4
 _ROLLED = RolloutConfig(time_ps=5000.0, lag_ps=10.0, solvent=TIP3P, seed=3, guard="off", force=True)
 # What is set to what runs show, without training.
-LEVELS = {"pace": set_pace, "populations": set_populations, "transfer": transfer}
+LEVELS = {"pace": set_pace, "transfer": transfer}
 
 
-def sets_of(folders: Sequence[Path], runs: int = 10_000, *, umbrella: bool = False) -> list[TrainingFrames]:
-    """Return the frames of every molecule in folders, of so many runs at most, under an `umbrella` potential or none.
-    Raises InputError for no frames, and for residues that weights are tested on, whatever their ends."""
+def sets_of(folders: Sequence[Path], runs: int = 10_000) -> list[TrainingFrames]:
+    """Return the frames of every molecule in folders, of so many runs at most. Raises InputError for no frames, and for
+    residues that weights are tested on, whatever their ends."""
     tested = {"-".join(p.residues) for p in (*unseen_peptides(), *held_out_peptides()) if len(p.residues) > 1}
     found = []
     for place in (place for folder in folders for place in sorted(folder.iterdir()) if place.is_dir()):
         if place.name.removeprefix("free-") in tested:
             raise InputError(f"{place}: weights are tested on these residues; leave it out of training.")
         if files := sorted(place.glob("run_*.h5"))[:runs]:
-            frames = collect_frames(files, umbrella=umbrella)
+            frames = collect_frames(files)
             share = max(Split.share, _HELD_FRAMES / int(np.diff(frames.starts).min()))
             found.append(replace(frames, split=Split(share)))
     if not found:
@@ -95,7 +94,7 @@ def rolled_in_water(start: Weights, folder: Path) -> Path:
 def with_levels(
     sets: Sequence[TrainingFrames], start: Weights, energies: dict[str, float], out: Path, what: str
 ) -> None:
-    """Write weights with the pace or the populations that frames show."""
+    """Write weights with the levels that frames show."""
     model = cast(PeptideSlide, start.model)
     chains = [chain_features(f.scene, model.config, f.conditions.get("solvent")) for f in sets]
     subjects = [PeptideSubject(f, chain).in_equilibrium(energies) for f, chain in zip(sets, chains, strict=True)]
@@ -129,7 +128,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     start = None if a.start is None else load_weights(weights_path(a.start))
     if a.tuned == "transfer" and start is not None:
         a.train = [rolled_in_water(start, a.out.with_name(f"{a.out.stem}-rollouts"))]
-    sets = sets_of(a.train, a.runs, umbrella=a.tuned == "populations")
+    sets = sets_of(a.train, a.runs)
     names = {id(frames): "-".join(frames.scene.residue_names) for frames in sets}
     alone = {f"ACE-{residue}-NME" for residue in RESIDUES}
     chains = sorted({*names.values()} - alone)

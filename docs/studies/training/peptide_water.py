@@ -3,7 +3,6 @@
     python docs/studies/training/peptide_water.py train FOLDER WATER OBC2 [--start W] [--runs 1 4 16]
                [--methods new states whole joint] [--steps 600]
     python docs/studies/training/peptide_water.py table FOLDER WATER OBC2 [--start W]
-    python docs/studies/training/peptide_water.py shipped FOLDER WATER [--earlier W]
 
 WATER and OBC2 are folders of `peptide_campaign`: what is in WATER/train is learned from, of each molecule so many runs,
 and what is in WATER/test is rolled as often and as long, from the same first frames. Weights W, for OBC2, are taken as
@@ -13,8 +12,7 @@ on both folders (`joint`); and weights are trained `new`, from nothing. `train` 
 one after the other in one process a core; what is there stays. `table` rolls them all beside MD in both solvents: how
 far torsions are from MD's in water (`peptide_unseen`, pooled), of every ψ the share of time in helices and how often it
 crosses to the other basin or back, this over MD's in the geometric mean, and the pace over that of MD by SIMD replicas
-on the same core. `shipped` lays populations by the shipped weights, and by earlier ones, beside those of MD under an
-umbrella potential in WATER/umbrella_test.
+on the same core.
 """
 
 from __future__ import annotations
@@ -40,12 +38,10 @@ from processes import in_order, is_trained
 from md_reference.run.machine import available_cores, machine_name
 from md_reference.simd.force_field import n_replicas
 from surrogate.comparison.measure.distributions import is_alpha
-from surrogate.comparison.read.ensemble import load_ensemble
 from surrogate.models.architecture import weights_path
-from surrogate.models.peptides.chains import POSITIVE_PHI_DEG
 from surrogate.models.weights import load_weights
 from systems.scene import Scene
-from systems.trajectory.codec import frame_factors, open_trajectory
+from systems.trajectory.codec import open_trajectory
 
 FloatArray = npt.NDArray[np.float64]
 SHIPPED = "peptides"
@@ -251,103 +247,12 @@ def make_table(folder: Path, water: Path, obc2: Path, start: str, out: Path) -> 
     write(out.with_stem(f"{out.stem}_helices"), columns, populations, words, note)
 
 
-SIDES = ("gauche+", "trans", "gauche-")
-ROLLED_PS, LEFT_OUT = 20_000.0, 100
-
-
-def states_of(turns: Sequence[Turn], residues: Sequence[str], x: FloatArray) -> dict[str, npt.NDArray[np.bool_]]:
-    """Return of frames, torsions `(n_frames, n_turns)` in rad, which are in each state of every ψ and χ1."""
-    found = {}
-    for turn, angle in zip(turns, x.T, strict=True):
-        name = residues[turn.residue]
-        if turn.kind == "psi":
-            found |= {f"ψ {name} {what}": of for what, of in (("helix", is_alpha(angle)), ("strand", ~is_alpha(angle)))}
-        if turn.kind == "chi1":
-            well = (np.degrees(angle) % 360.0 // 120.0).astype(int)
-            found |= {f"χ1 {name} {side}": well == k for k, side in enumerate(SIDES)}
-    return found
-
-
-def shares_of(
-    turns: Sequence[Turn], residues: Sequence[str], runs: Sequence[FloatArray], weights: Sequence[FloatArray]
-) -> dict[str, tuple[float, float]]:
-    """Return the share of each state among frames with every φ negative, in %, and its standard error by leaving one
-    run out after the other."""
-    phi = [k for k, t in enumerate(turns) if t.kind == "phi"]
-    left = [w * ((x[:, phi] < 0.0) | (np.degrees(x[:, phi]) > POSITIVE_PHI_DEG[1])).all(axis=1)
-            for x, w in zip(runs, weights, strict=True)]  # fmt: skip
-    inside = [states_of(turns, residues, x) for x in runs]
-    total, n, found = np.array([w.sum() for w in left]), len(runs), {}
-    for name in inside[0]:
-        held = np.array([w[each[name]].sum() for w, each in zip(left, inside, strict=True)])
-        without = (held.sum() - held) / (total.sum() - total)
-        found[name] = 100.0 * float(held.sum() / total.sum()), 100.0 * math.sqrt((n - 1) * float(without.var()))
-    return found
-
-
-def shipped_table(folder: Path, water: Path, earlier: str | None, out: Path) -> None:
-    """Lay populations of states of the shipped weights, in water and in OBC2, and of earlier ones in water, beside
-    those of MD under an umbrella potential, and say how often ψ crosses."""
-    of_md: dict[str, tuple[float, float]] = {}
-    ways = {
-        "earlier ones": (earlier, "tip3p"),
-        f"`{SHIPPED}`": (SHIPPED, "tip3p"),
-        f"`{SHIPPED}` in OBC2": (SHIPPED, "obc2"),
-    }
-    found: dict[str, dict[str, tuple[float, float]]] = {way: {} for way, (name, _) in ways.items() if name}
-    crossed: dict[str, dict[str, str]] = {way: {} for way in found}
-    said = []
-    for place in sorted((water / "umbrella_test").iterdir()):
-        md = load_ensemble(sorted(place.glob("run_*.h5")))
-        turns, scene = turns_of(md.scene), md.scene
-        residues = [name for name in scene.residue_names if name not in ("ACE", "NME")]
-        assert md.differences_kj_mol is not None
-        factors = frame_factors(md.differences_kj_mol, 300.0)
-        of_md |= shares_of(turns, residues, [angles(turns, np.asarray(x)) for x in md.segments], factors)
-        said.append(f"{md.length_words} of {place.name}")
-        for way, crossings in crossed.items():
-            name, solvent = ways[way]
-            weights = load_weights(weights_path(str(name)))
-            outs = [
-                folder / f"{weights.path.stem}-{solvent}" / place.name / f"{k:02d}.h5" for k in range(len(md.segments))
-            ]
-            starts = np.stack([x[0] for x in md.segments]).astype(np.float64)
-            frames = rolled(weights, scene, outs, ROLLED_PS, FRAMES_PS, solvent, starts)
-            runs = [angles(turns, x)[LEFT_OUT:] for x in frames]
-            found[way] |= shares_of(turns, residues, runs, [np.ones(len(x)) for x in runs])
-            for k, turn in enumerate(turns):
-                if turn.kind == "psi":
-                    often = [1e3 * psi_crossings(x[:, k]) / (FRAMES_PS * len(x)) for x in runs]
-                    crossings[f"ψ {residues[turn.residue]}"] = with_error(
-                        lambda some, o=often: np.mean([o[q] for q in some]), len(runs)
-                    )
-    rows = [[name, *(f"{share:.0f} ± {error:.0f}" for share, error in (of[name] for of in (of_md, *found.values())))]
-            for name in of_md if not name.endswith((" strand", " gauche-"))]  # fmt: skip
-    off = [
-        np.mean([(of[name][0] - share) ** 2 - error**2 for name, (share, error) in of_md.items()])
-        for of in found.values()
-    ]
-    rows.append(["error of all states", "", *(f"{math.sqrt(max(0.0, x)):.0f}" for x in off)])
-    rows += [
-        [f"{name}, crossings per ns", "", *(crossed[way][name] for way in found)]
-        for name in next(iter(crossed.values()))
-    ]
-    note = (
-        f"Share of time in %, of frames with every φ negative. MD under an umbrella potential: {'; '.join(said)}. "
-        f"Rollouts: as many of {1e-3 * ROLLED_PS:g} ns from its first frames. Errors by leaving runs out; that of all "
-        "states is the root mean square, less MD's own."
-    )
-    words = "shipped FOLDER WATER" + " --earlier EARLIER.safetensors" * (earlier is not None)
-    write(out, ["", "MD in TIP3P", *found], rows, words, note)
-
-
 def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("what", choices=("train", "table", "shipped"))
+    parser.add_argument("what", choices=("train", "table"))
     parser.add_argument("folder", type=Path)
     parser.add_argument("water", type=Path)
-    parser.add_argument("obc2", type=Path, nargs="?")
-    parser.add_argument("--earlier")
+    parser.add_argument("obc2", type=Path)
     parser.add_argument("--start", default=SHIPPED)
     parser.add_argument("--methods", nargs="+", choices=TRAINED, default=list(TRAINED))
     parser.add_argument("--runs", type=int, nargs="+", default=(1, 4, 16))
@@ -355,12 +260,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--workers", type=int, default=available_cores())
     parser.add_argument("-o", "--out", type=Path, default=TABLES / "peptides_water.json")
     a = parser.parse_args(arguments)
-    if a.obc2 is None and a.what != "shipped":
-        parser.error("name the folder of OBC2, too.")
     a.folder.mkdir(parents=True, exist_ok=True)
-    if a.what == "shipped":
-        shipped_table(a.folder, a.water, a.earlier, a.out.with_stem(f"{a.out.stem}_shipped"))
-        return
     if a.what == "table":
         make_table(a.folder, a.water, a.obc2, a.start, a.out)
         return

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from itertools import combinations, pairwise
+from collections.abc import Mapping, Sequence
+from itertools import combinations
 from typing import NamedTuple, cast
 
 import torch
@@ -38,6 +38,9 @@ _RIDGE, _MOST = 0.3, 3.0
 # level says for all peptides is from each, and what holds levels near zero.
 _FRAMES, _STEP_PS, _STEPS = 1000, 10.0, (2, 10)
 _CHANGES_PASSES, _MOLECULES_DIFFER, _CHANGES_RIDGE = 3, 0.1, 5.0
+# How far, squared, logarithms of ratios of populations in another solvent differ from those of the first between types
+# of residues, and in what all have alike.
+_TYPES_DIFFER, _LACKING_ALIKE = 0.5, 1.0
 # Where psi stands among torsions.
 _PSI = 1
 # Neighbours that are no residues: free ends and caps.
@@ -170,51 +173,34 @@ def _paces(model: PeptideSlide, subject: PeptideSubject) -> dict[tuple[int, int,
             for r, k, a, b in _pairs_of_states(subject, held, signs=True)}  # fmt: skip
 
 
-@torch.no_grad()
-def set_populations(model: PeptideSlide, subjects: Sequence[PeptideSubject]) -> None:
-    """Move changes of psi and side chains, one direction against the other, to the populations of states that frames of
-    `subjects` have, which do not run in time as molecules do: of psi first by what residues beside others lack alike,
-    on either side, then by what each type lacks beyond. Residues between caps keep their mean, and all their pace."""
-    ends = _ends(model)
-    for solvent, jumps in enumerate(cast(list[StateJumps], list(model.all_jumps))):
-        some = [s for s in subjects if s.chain.solvent == solvent and s.weights is not None]
-        for _ in range(_CHANGES_PASSES if some else 0):
-            found: dict[tuple[int, int, int], list[Change]] = {}
-            for change in (change for subject in some for change in lacking_populations(model, subject)):
-                found.setdefault((change.torsion, *change.states), []).append(change)
-            for (torsion, a, b), each in found.items():
-                has = F.one_hot(torch.tensor([c.types[0] for c in each]), jumps.of_change.shape[1]).double()
-                beside = torch.tensor(
-                    [[torsion == _PSI and kind not in ends for kind in c.types[1:]] for c in each]
-                ).double()
-                left = [max(-_MOST, min(c.lacking, _MOST)) for c in each]
-                common = _nearest(beside, each, left)
-                own = _nearest(has, each, (torch.tensor(left).double() - beside @ common.double()).tolist())
-                levels = torch.cat([own[None], common[:, None].expand(-1, len(own))])
-                levels[1:, ends] = 0.0
-                jumps.raise_change(torsion, a, b, levels.to(jumps.of_change.device) / 2)
-                jumps.raise_change(torsion, b, a, -levels.to(jumps.of_change.device) / 2)
+def population_levels(model: PeptideSlide, some: Sequence[Change]) -> dict[tuple[int, int, int], Tensor]:
+    """Return, by (torsion, state, state), the levels `(3, n_types)` of residues, of those before and of those after by
+    which the second state should become likelier beside the first: what each type lacks, and of psi what residues lack
+    alike beside one before, and beside one after. They are the likeliest where these scatter about zero as
+    `_TYPES_DIFFER` and `_LACKING_ALIKE` say."""
+    ends, found = _ends(model), {}
+    for key in dict.fromkeys((c.torsion, *c.states) for c in some):
+        each = [c for c in some if (c.torsion, *c.states) == key]
+        has = F.one_hot(torch.tensor([c.types[0] for c in each]), model.config.n_types).double()
+        beside = [[key[0] == _PSI and kind not in ends for kind in c.types[1:]] for c in each]
+        part = torch.cat([has, torch.tensor(beside).double()], dim=1)
+        scatter = torch.tensor([_TYPES_DIFFER] * has.shape[1] + [_LACKING_ALIKE] * 2).double()
+        weighed = torch.tensor([c.counted for c in each]).double() * part.T
+        lacking = torch.tensor([c.lacking for c in each]).double()
+        levels = torch.linalg.solve(weighed @ part + torch.diag(1.0 / scatter), weighed @ lacking).float()
+        found[key] = torch.cat([levels[None, :-2], levels[-2:, None].expand(-1, has.shape[1])]).clone()
+        found[key][1:, ends] = 0.0
+    return found
 
 
 @torch.no_grad()
-def lacking_populations(model: PeptideSlide, subject: PeptideSubject) -> list[Change]:
-    """Return every two states of a peptide's torsions, but the signs of phi, that enough of its frames are in, drawn by
-    their weights, with the jackknife variance over its runs."""
-    assert subject.weights is not None
-    generator = torch.Generator().manual_seed(_SIDE_SEED)
-    idx = torch.multinomial(torch.from_numpy(subject.weights), _FRAMES, True, generator=generator)
-    flux, _, held = _fluxes(model, subject, idx, generator)
-    every = subject.states(torch.arange(subject.frames.n_frames))
-    weights, starts = torch.from_numpy(subject.weights), subject.frames.starts.tolist()
-    is_now = F.one_hot(every, chains.MOST_STATES) * weights[:, None, None, None]
-    of_runs = torch.stack([is_now[a:b].sum(0) for a, b in pairwise(starts)])
-    rest = (of_runs.sum(0) - of_runs).clamp(min=1e-9).log()
-    n, types = len(rest), subject.chain.places[:, :3].tolist()
-    return [
-        Change((*types[r],), k, (a, b), float(flux[r, k, b, a] - flux[r, k, a, b]),
-               float((n - 1) * (rest[:, r, k, a] - rest[:, r, k, b]).var(correction=0)))
-        for r, k, a, b in _pairs_of_states(subject, held)
-    ]  # fmt: skip
+def raise_populations(model: PeptideSlide, solvent: int, levels: Mapping[tuple[int, int, int], Tensor]) -> None:
+    """Move changes between two states in a solvent, one direction against the other, by levels as of
+    `population_levels`: the pace stays."""
+    jumps = cast(StateJumps, model.all_jumps[solvent])
+    for (torsion, a, b), each in levels.items():
+        jumps.raise_change(torsion, a, b, each.to(jumps.of_change.device) / 2)
+        jumps.raise_change(torsion, b, a, -each.to(jumps.of_change.device) / 2)
 
 
 def _levels(jumps: StateJumps, types: Sequence[Sequence[int]], lacking: Sequence[float], ridge: float) -> Tensor:

@@ -19,7 +19,6 @@ from surrogate.models.peptides.layout import PeptideConfig
 from surrogate.models.peptides.model import PeptideSlide
 from systems.errors import InputError
 from systems.scene import FloatArray, IntArray
-from systems.trajectory.codec import reweighting
 
 # Weights that turn frames of short runs from chosen starts into equilibrium, by a reversible Markov model. Forward
 # windows need none, whatever they start from: a propagator is conditional. A window read backwards does: it starts
@@ -135,8 +134,7 @@ class PeptideSubject:
     weights: FloatArray | None = None
 
     def in_equilibrium(self, positive_phi_kt: Mapping[str, float]) -> PeptideSubject:
-        """Return this subject with weights, or itself where its runs do not show how likely its states are. Of MD under
-        an umbrella potential weights are those without it."""
+        """Return this subject with weights, or itself where its runs do not show how likely its states are."""
         ranges = self.frames.split.ranges(self.frames.starts, validation=False)
         kept = np.concatenate([np.arange(low, high) for low, high in ranges])
         states, shares = self._signs_of_phi(kept, positive_phi_kt)
@@ -148,9 +146,6 @@ class PeptideSubject:
             return self
         weights = np.zeros(self.frames.n_frames)
         weights[kept] = found
-        if (differences := self.frames.differences_kj_mol) is not None:
-            weights *= reweighting(differences, float(self.frames.conditions["temperature_k"]))[0]
-            weights *= len(kept) / weights.sum()
         return replace(self, weights=weights)
 
     def _signs_of_phi(self, kept: IntArray, positive_phi_kt: Mapping[str, float]) -> tuple[IntArray, FloatArray]:
