@@ -57,7 +57,7 @@ COLUMNS = ("molecule", "batch", "ns", "residue", "torsion", "populations", "erro
 TIP3P, SHIPPED = "tip3p", "peptides"
 # Rollouts by which populations are counted, how much of their beginning is left out, and, where it is counted how often
 # psi crosses, the time between frames.
-ROLLOUTS, ROLLED_PS, LEFT_OUT_PS, LAG_PS, FINE_LAG_PS = 16, 50_000.0, 10_000.0, 50.0, 10.0
+ROLLOUTS, ROLLED_PS, LEFT_OUT_PS, LAG_PS, FINE_LAG_PS = 16, 30_000.0, 2_000.0, 20.0, 10.0
 PASSES = 3
 # Between states lie so many degrees on either side of their ends.
 CORE_DEG = 25.0

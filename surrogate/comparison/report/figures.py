@@ -346,7 +346,7 @@ def answer_overview(molecule: str, answer: dict[str, Any]) -> MatplotlibFigure:
     bars.set(xlabel="population", title=molecule)
     if states:
         bars.invert_yaxis()
-        bars.legend(fontsize=8)
+        figure.legend(loc="outside lower left", ncols=2, fontsize=8)
     for axes, (label, energy) in zip(others, maps, strict=True):
         values = np.array([[math.nan if x is None else x for x in row] for row in energy])
         image = _map(axes, values, (_CIRCLE, _CIRCLE))
