@@ -25,6 +25,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from itertools import combinations
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -121,8 +122,8 @@ def together(some: Sequence[Torsion]) -> list[Torsion]:
 
 
 class Place(NamedTuple):
-    """Where a torsion of a molecule stands in a model: the `row` of its stated torsions, how many states it has
-    (`count`), and by how many places these are `shifted`: a model may tell them by other atoms."""
+    """Where a torsion stands in a model: its `row` among the torsions that have states, how many states it has
+    (`count`), and by how many places these are `shifted`: a model may count them from other atoms."""
 
     row: int
     count: int
@@ -159,9 +160,10 @@ def populations(
     kept = [(x[..., 0] == 0).all(axis=1) for x in states]
     for at, place in places_of(scene, chain).items():
         ends, labels, visits = stated.ends_deg[place.row].numpy(), [], []
-        for angles_rad, negative in zip(rows, kept, strict=True):
+        residue, slot = int(stated.residue[place.row]), int(stated.slot[place.row])
+        for angles_rad, of_all, negative in zip(rows, states, kept, strict=True):
+            state = of_all[:, residue, slot]
             ahead = (np.degrees(angles_rad[:, place.row]) - float(stated.first_deg[place.row])) % 360.0
-            state = (ahead[:, None] >= ends[1:-1]).sum(axis=1)
             inside = np.minimum(ahead - ends[state], ends[state + 1] - ahead) >= CORE_DEG
             last = np.maximum.accumulate(np.where(inside, np.arange(len(state)), -1))
             visits.append(np.where(last >= 0, state[last], -1))
@@ -174,12 +176,13 @@ def populations(
 def gather(water: Path, model: PeptideSlide) -> None:
     """Add what a folder holds to the table."""
     lines = RECORD.read_text("utf-8").splitlines() if RECORD.exists() else ["\t".join(COLUMNS)]
+    known = recorded()
     for place in sorted(path for kind in ("umbrella_test", "umbrella") for path in (water / kind).glob("*")):
         batches: dict[int, list[Path]] = {}
         for file in sorted(place.glob("run_*.h5")):
             batches.setdefault(int(file.stem.removeprefix("run_")) // n_replicas(), []).append(file)
         for number, files in batches.items():
-            if (place.name, number) in recorded() or len(files) < n_replicas():
+            if (place.name, number) in known or len(files) < n_replicas():
                 continue
             md = load_ensemble(files)
             assert md.differences_kj_mol is not None
@@ -240,11 +243,13 @@ def set_populations(out: Path, start: Weights) -> None:
     model, torsions = start.model, learned()
     assert isinstance(model, PeptideSlide)
     moved: Levels = {}
+    solvent = model.config.solvents.index(TIP3P)
     for k in range(PASSES):
-        folder = out.with_name(f"{out.stem}-rollouts") / str(k)
-        changes = [c for each in lacking(start, torsions, folder).values() for c in each]
+        # Rollouts of a pass are of no other table's.
+        with TemporaryDirectory() as folder:
+            changes = [c for each in lacking(start, torsions, Path(folder)).values() for c in each]
         levels = population_levels(model, [c._replace(lacking=c.lacking + told(moved, c)) for c in changes])
-        raise_populations(model, chain_solvent(model), {key: x - moved.get(key, 0.0) for key, x in levels.items()})
+        raise_populations(model, solvent, {key: x - moved.get(key, 0.0) for key, x in levels.items()})
         moved = levels
         sys.stdout.write(f"pass {k}: off by {off_by(changes):.2f}\n")
     molecules = sorted({t.molecule for t in torsions})
@@ -252,10 +257,6 @@ def set_populations(out: Path, start: Weights) -> None:
              "molecules": molecules}  # fmt: skip
     domain = with_sequences(start.domain, [f"ACE-{name}-NME" for name in molecules])
     save_weights(out, model, domain, provenance_of({}, about, start), half=True)
-
-
-def chain_solvent(model: PeptideSlide) -> int:
-    return model.config.solvents.index(TIP3P)
 
 
 def with_sequences(domain: TrainingDomain, sequences: Sequence[str]) -> TrainingDomain:

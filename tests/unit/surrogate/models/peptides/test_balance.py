@@ -204,17 +204,17 @@ def test_levels_are_the_likeliest_by_what_is_lacking_and_how_it_errs() -> None:
     model = PeptideSlide(config)
     alanine, serine, valine, ace, nme = (2 + config.types.index(name) for name in ("ALA", "SER", "VAL", "ACE", "NME"))
     side = population_levels(model, [Change((serine, alanine, nme), 2, (0, 1), 1.0, 0.4)])
-    # One residue: N(1, 0.4 + 0.1) beside N(0, 0.5).
-    assert side[2, 0, 1][0, serine] == pytest.approx(0.5) and side[2, 0, 1].abs().sum() == pytest.approx(0.5)
-    # Of psi what lies beside a residue is asked as well: N(0, 0.5 + 1).
+    # One residue: N(1, 0.4 + 0.1) beside N(0, 0.1).
+    assert side[2, 0, 1][0, serine] == pytest.approx(1 / 6) and side[2, 0, 1].abs().sum() == pytest.approx(1 / 6)
+    # Of psi what lies beside a residue is asked as well: N(0, 0.1 + 1).
     psi = population_levels(model, [Change((serine, alanine, nme), 1, (0, 1), 1.0, 0.4)])[1, 0, 1]
-    assert psi[0, serine] == pytest.approx(0.25) and psi[1, alanine] == psi[1, valine] == pytest.approx(0.5)
+    assert psi[0, serine] == pytest.approx(1 / 16) and psi[1, alanine] == psi[1, valine] == pytest.approx(10 / 16)
     assert not psi[1:, [ace, nme]].any() and not psi[2].any()
     capped = population_levels(model, [Change((serine, ace, nme), 1, (0, 1), 1.0, 0.4)])[1, 0, 1]
-    assert capped[0, serine] == pytest.approx(0.5) and not capped[1:].any()
+    assert capped[0, serine] == pytest.approx(1 / 6) and not capped[1:].any()
     sure = [Change((kind, ace, nme), 2, (0, 2), x, 0.0) for kind in (serine, valine) for x in (1.0, 3.0)]
     both = population_levels(model, sure)[2, 0, 2][0, [serine, valine]]
-    assert both.tolist() == pytest.approx([2.0 * 20.0 / 22.0] * 2), "the mean of two, held by their own scatter"
+    assert both.tolist() == pytest.approx([2.0 * 20.0 / 30.0] * 2), "the mean of two, held by their own scatter"
 
 
 def change_of(jumps: torch.nn.Module, config: PeptideConfig, name: str) -> float:
