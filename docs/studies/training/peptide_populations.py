@@ -176,8 +176,11 @@ def populations(
 def gather(water: Path, model: PeptideSlide) -> None:
     """Add what a folder holds to the table."""
     lines = RECORD.read_text("utf-8").splitlines() if RECORD.exists() else ["\t".join(COLUMNS)]
-    known = recorded()
-    for place in sorted(path for kind in ("umbrella_test", "umbrella") for path in (water / kind).glob("*")):
+    known, n = recorded(), len(lines)
+    places = sorted(path for kind in ("umbrella_test", "umbrella") for path in (water / kind).glob("*"))
+    if not places:
+        raise SystemExit(f"{water} holds no MD under an umbrella potential; name a folder of peptide_campaign.")
+    for place in places:
         batches: dict[int, list[Path]] = {}
         for file in sorted(place.glob("run_*.h5")):
             batches.setdefault(int(file.stem.removeprefix("run_")) // n_replicas(), []).append(file)
@@ -193,6 +196,7 @@ def gather(water: Path, model: PeptideSlide) -> None:
                 percents = (" ".join(f"{100.0 * x:.1f}" for x in some) for some in both)
                 lines.append("\t".join([place.name, str(number), f"{ns:.3g}", str(residue), name, *percents]))
     RECORD.write_text("\n".join(lines) + "\n", "utf-8")
+    sys.stdout.write(f"{len(lines) - n} torsions added\n")
 
 
 def learned() -> list[Torsion]:
