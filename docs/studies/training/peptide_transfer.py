@@ -1,14 +1,17 @@
 """Train weights for peptides on runs in one solvent or several, from nothing or from others.
 
     python docs/studies/training/peptide_transfer.py OUT.safetensors --train FOLDER [FOLDER ...] --budget 1h
-               [--start WEIGHTS] [--tuned all|flow|states] [--coupled] [--runs 16] [--steps N] [--unseen 12] [--half]
+               [--start WEIGHTS] [--tuned all|flow|states] [--coupled] [--rehearse] [--runs 16] [--steps N]
+               [--unseen 12] [--half]
     python docs/studies/training/peptide_transfer.py OUT.safetensors --train FOLDER [FOLDER ...] --start WEIGHTS
                --tuned pace
     python docs/studies/training/peptide_transfer.py OUT.safetensors --start WEIGHTS --tuned transfer
 
 FOLDER: `train` in a folder of `peptide_campaign` or `peptide_runs`, of each molecule in it the first `--runs`. `flow`
 and `states` train the flow or the probabilities of torsion states alone, and need `--start`. `--unseen`: every so many
-molecules of several residues one is left out, and the curves show its loss. `--half` rounds to float16 at the end. Free
+molecules of several residues one is left out, and the curves show its loss. `--rehearse`: the MD that `--start` was
+trained on is gone; its own rollouts of those molecules, which lie beside OUT, keep the probabilities of states near to
+what they were, in as many steps as are trained on MD. `--half` rounds to float16 at the end. Free
 energies of φ > 0 are those of `peptide_energies` beside OUT, or those that the weights gone on from were trained with.
 A training that was stopped goes on. These train nothing: `transfer` gives TIP3P the probabilities of OBC2, as often as
 its own have it (`balance.transfer`), in the mean over rollouts in it, which lie beside OUT; `pace` sets how often ψ
@@ -27,7 +30,7 @@ from typing import Any, cast
 import numpy as np
 from peptide_campaign import order
 from peptide_energies import known_energies
-from peptide_list import RESIDUES, held_out_peptides, unseen_peptides
+from peptide_list import RESIDUES, Peptide, held_out_peptides, unseen_peptides
 from processes import is_trained
 
 from surrogate.data import FrameSets, Split, TrainingFrames, collect_frames
@@ -46,9 +49,14 @@ from systems.units import parse_wall_s
 _VALIDATE_S = 300.0
 # The end of each run that is held out has at least so many frames, more than a chunk.
 _HELD_FRAMES = 20
-# Of each molecule, to give TIP3P the probabilities of OBC2.
+# Rollouts of each molecule: to give TIP3P the probabilities of OBC2, and to rehearse what weights know of others, these
+# at two spacings by turns.
 TIP3P, _ROLLOUTS = "tip3p", 4
 _ROLLED = RolloutConfig(time_ps=5000.0, lag_ps=10.0, solvent=TIP3P, seed=3, guard="off", force=True)
+_REHEARSALS = 16
+_REHEARSED = tuple(
+    RolloutConfig(time_ps=200 * lag_ps, lag_ps=lag_ps, seed=4, guard="off", force=True) for lag_ps in (10.0, 10.0, 1.0)
+)
 # What is set to what runs show, without training.
 LEVELS = {"pace": set_pace, "transfer": transfer}
 
@@ -79,15 +87,31 @@ def trained_with(provenance: dict[str, Any] | None) -> dict[str, float]:
     return {}
 
 
+def rolled_peptide(start: Weights, folder: Path, peptide: Peptide, n: int, how: RolloutConfig) -> None:
+    """Roll a peptide `n` times into a folder of its own, unless it is there."""
+    outs = [folder / peptide.name / f"run_{k:03d}.h5" for k in range(n)]
+    if not all(out.exists() for out in outs):
+        outs[0].parent.mkdir(parents=True, exist_ok=True)
+        rollout(build_peptide(peptide.sequence), start, outs, how, overwrite=True)
+
+
 def rolled_in_water(start: Weights, folder: Path) -> Path:
     """Roll every residue between caps, and as many pairs, in TIP3P, and return the folder with a folder of each."""
     water = [p for kind, p, number in order(TIP3P) if (kind, number) == ("train", 0) and p.capped]
     for n in (1, 2):
         for peptide in [p for p in water if len(p.residues) == n][: len(RESIDUES)]:
-            outs = [folder / peptide.name / f"run_{k:03d}.h5" for k in range(_ROLLOUTS)]
-            if not all(out.exists() for out in outs):
-                outs[0].parent.mkdir(parents=True, exist_ok=True)
-                rollout(build_peptide(peptide.sequence), start, outs, _ROLLED, overwrite=True)
+            rolled_peptide(start, folder, peptide, _ROLLOUTS, _ROLLED)
+    return folder
+
+
+def rehearsed(start: Weights, folder: Path) -> Path:
+    """Roll every molecule that weights were trained on in their first solvent, and return the folder."""
+    own = start.domain.conditions.get("solvent")
+    members = [replace(m, further=()) for m in start.domain.members if m.conditions.get("solvent") == own]
+    for k, names in enumerate(dict.fromkeys(names for member in members for names in member.peptides)):
+        residues = tuple(name for name in names if name not in ("ACE", "NME"))
+        peptide = Peptide(residues, capped=len(residues) < len(names), n_starts=0, time_ps=0.0)
+        rolled_peptide(start, folder, peptide, _REHEARSALS, _REHEARSED[k % len(_REHEARSED)])
     return folder
 
 
@@ -113,6 +137,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--start")
     parser.add_argument("--tuned", choices=(*TUNED, *LEVELS), default="all")
     parser.add_argument("--coupled", action="store_true")
+    parser.add_argument("--rehearse", action="store_true")
     parser.add_argument("--runs", type=int, default=10_000)
     parser.add_argument("--unseen", type=int, default=0)
     parser.add_argument("--budget", type=lambda text: parse_wall_s(text, "--budget"))
@@ -121,6 +146,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     a = parser.parse_args(arguments)
     if a.tuned in LEVELS and a.start is None:
         parser.error(f"--tuned {a.tuned} goes on from weights: name them by --start.")
+    if a.rehearse and a.start is None:
+        parser.error("--rehearse keeps what weights know: name them by --start.")
     if a.tuned != "transfer" and not a.train:
         parser.error("name the folders of runs by --train.")
     if is_trained(a.out):
@@ -145,7 +172,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
         budget_s=a.budget, steps=a.steps, time_reversal=True, positive_phi_kt=energies, tuned=a.tuned,
         validate_every_s=_VALIDATE_S,
     )  # fmt: skip
-    train_peptides(sets, a.out, PeptideConfig(coupled=a.coupled), training, unseen=unseen, start=start, resume=True)
+    of = FrameSets(tuple(sets), tuple(unseen))
+    if a.rehearse and start is not None:
+        of = of._replace(rehearsed=tuple(sets_of([rehearsed(start, a.out.with_name("rehearsed"))])))
+    train_peptides(of, a.out, PeptideConfig(coupled=a.coupled), training, start=start, resume=True)
     if a.half:
         found = load_weights(a.out)
         save_weights(a.out, found.model, found.domain, found.provenance, half=True)
