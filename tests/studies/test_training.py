@@ -6,13 +6,16 @@ import math
 import re
 from collections import Counter
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import lag_errors
 import numpy as np
 import peptide_campaign
 import peptide_correction
+import peptide_list
 import peptide_populations
+import peptide_reference
 import peptide_runs
 import peptide_seeds
 import peptide_transfer
@@ -33,7 +36,7 @@ from peptide_list import (
     unseen_peptides,
     wide_peptides,
 )
-from peptide_scores import Turn, psi_crossings
+from peptide_scores import Turn, psi_crossings, turns_of
 
 from small_scenes import beyond, rotated, with_phi_turned
 from surrogate.comparison.rows.published_metrics import TABLE
@@ -200,6 +203,46 @@ def test_a_rare_positive_phi_plays_no_part() -> None:
     for x in md[:5]:
         x[:10, 0] = 1.0
     assert len(peptide_unseen.never(md, [0])) == 8, "too few are without"
+
+
+def test_longer_steps_in_water_are_learned_from_shorter_ones_alone(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """What is known in OBC2, the flow and what weights cover stay; nothing but rollouts is read."""
+    one = [peptide_list.Peptide(("ALA",), True, 0, 0.0)]
+    monkeypatch.setattr(peptide_transfer, "in_water", lambda start: one)
+    for name, time_ps in (("AGREEING", 600.0), ("STAYING", 60.0)):
+        monkeypatch.setattr(peptide_transfer, name, (2, replace(getattr(peptide_transfer, name)[1], time_ps=time_ps)))
+    out = tmp_path / "w.safetensors"
+    peptide_transfer.main([str(out), "--start", "peptides", "--tuned", "lags", "--steps", "4"])
+    start, found = load_weights(weights_path("peptides")), load_weights(out)
+    assert found.domain.peptides == start.domain.peptides and found.provenance["from"]["tuned"] == "populations"
+    after = found.model.state_dict()
+    moved = {name.split(".")[0] for name, x in start.model.state_dict().items() if not torch.equal(x, after[name])}
+    assert moved == {"jumps_elsewhere"}
+    with pytest.raises(SystemExit):
+        peptide_transfer.main([str(tmp_path / "x.safetensors"), "--tuned", "lags", "--steps", "4"])
+
+
+def test_md_of_tests_is_told_by_its_torsions(tmp_path: Path) -> None:
+    """A record parts every bin of histograms as the angles do, and each molecule is built in the order of its runs."""
+    scene, rng = build_peptide("ALA-GLY"), np.random.default_rng(0)
+    frames = [scene.positions_nm + 0.01 * rng.normal(size=(40, scene.n_atoms, 3)) for _ in range(4)]
+    turned = [rng.uniform(-np.pi, np.pi, size=(500, len(turns_of(scene)))) for _ in range(4)]
+    some = peptide_reference.Reference("free-ALA-GLY", scene, "obc2", turned, np.stack([x[0] for x in frames]))
+    peptide_reference.write(tmp_path / "a.npz", [some])
+    (found,) = peptide_reference.references(tmp_path / "a.npz")
+    assert found.scene.topology_hash == scene.topology_hash and (found.name, found.solvent) == (some.name, "obc2")
+    assert found.time_ps == 5000.0 and not found.files
+    np.testing.assert_allclose(found.starts_nm, some.starts_nm, atol=1e-6)
+    for one, other in zip(found.torsions, turned, strict=True):
+        np.testing.assert_allclose(one, other, atol=np.pi / 900 + 1e-9)
+    count = [np.ones(500)] * 4
+    for histograms in (peptide_unseen.densities, partial(peptide_unseen.joint_densities, pairs=[(0, 1)])):
+        for one, other in zip(histograms(found.torsions, count), histograms(turned, count), strict=True):
+            np.testing.assert_array_equal(one, other)
+    with pytest.raises(InputError, match="no molecule"):
+        list(peptide_reference.references(tmp_path))
 
 
 def test_mdgens_recipe_is_over_a_replicate() -> None:

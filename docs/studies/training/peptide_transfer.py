@@ -1,21 +1,21 @@
 """Train weights for peptides on runs in one solvent or several, from nothing or from others.
 
     python docs/studies/training/peptide_transfer.py OUT.safetensors --train FOLDER [FOLDER ...] --budget 1h
-               [--start WEIGHTS] [--tuned all|flow|states] [--coupled] [--rehearse] [--runs 16] [--steps N]
-               [--unseen 12] [--half]
+               [--start WEIGHTS] [--tuned all|flow|states] [--coupled] [--runs 16] [--steps N] [--unseen 12] [--half]
     python docs/studies/training/peptide_transfer.py OUT.safetensors --train FOLDER [FOLDER ...] --start WEIGHTS
                --tuned pace
     python docs/studies/training/peptide_transfer.py OUT.safetensors --start WEIGHTS --tuned transfer
+    python docs/studies/training/peptide_transfer.py OUT.safetensors --start WEIGHTS --tuned lags --steps N
 
 FOLDER: `train` in a folder of `peptide_campaign` or `peptide_runs`, of each molecule in it the first `--runs`. `flow`
 and `states` train the flow or the probabilities of torsion states alone, and need `--start`. `--unseen`: every so many
-molecules of several residues one is left out, and the curves show its loss. `--rehearse`: the MD that `--start` was
-trained on is gone; its own rollouts of those molecules, which lie beside OUT, keep the probabilities of states near to
-what they were, in as many steps as are trained on MD. `--half` rounds to float16 at the end. Free
+molecules of several residues one is left out, and the curves show its loss. `--half` rounds to float16 at the end. Free
 energies of φ > 0 are those of `peptide_energies` beside OUT, or those that the weights gone on from were trained with.
-A training that was stopped goes on. These train nothing: `transfer` gives TIP3P the probabilities of OBC2, as often as
-its own have it (`balance.transfer`), in the mean over rollouts in it, which lie beside OUT; `pace` sets how often ψ
-changes its state beside other residues to what runs show (`balance.set_pace`). Populations: `peptide_populations`.
+A training that was stopped goes on. These take no MD: `transfer` gives TIP3P the probabilities of OBC2, as often as
+its own have it (`balance.transfer`), in the mean over rollouts in it, which lie beside OUT; `lags` trains those of
+TIP3P on its own rollouts by steps of 10 ps, so that longer steps lead where these do, and keeps those of shorter steps.
+`pace` sets how often ψ changes its state beside other residues to what runs show (`balance.set_pace`). Populations:
+`peptide_populations`.
 """
 
 from __future__ import annotations
@@ -49,16 +49,18 @@ from systems.units import parse_wall_s
 _VALIDATE_S = 300.0
 # The end of each run that is held out has at least so many frames, more than a chunk.
 _HELD_FRAMES = 20
-# Rollouts of each molecule: to give TIP3P the probabilities of OBC2, and to rehearse what weights know of others, these
-# at two spacings by turns.
-TIP3P, _ROLLOUTS = "tip3p", 4
+TIP3P = "tip3p"
 _ROLLED = RolloutConfig(time_ps=5000.0, lag_ps=10.0, solvent=TIP3P, seed=3, guard="off", force=True)
-_REHEARSALS = 16
-_REHEARSED = tuple(
-    RolloutConfig(time_ps=200 * lag_ps, lag_ps=lag_ps, seed=4, guard="off", force=True) for lag_ps in (10.0, 10.0, 1.0)
-)
+# Rollouts of each molecule by which TIP3P takes over the probabilities of OBC2; by which longer steps agree with those
+# of 10 ps; and by which shorter ones stay.
+TAKING_OVER, AGREEING, STAYING = (
+    (4, _ROLLED), (16, replace(_ROLLED, time_ps=6000.0, seed=5)),
+    (16, replace(_ROLLED, time_ps=60.0, lag_ps=1.0, seed=6)),
+)  # fmt: skip
 # What is set to what runs show, without training.
 LEVELS = {"pace": set_pace, "transfer": transfer}
+# What goes on from weights without MD.
+ALONE = ("transfer", "lags")
 
 
 def sets_of(folders: Sequence[Path], runs: int = 10_000) -> list[TrainingFrames]:
@@ -87,32 +89,38 @@ def trained_with(provenance: dict[str, Any] | None) -> dict[str, float]:
     return {}
 
 
-def rolled_peptide(start: Weights, folder: Path, peptide: Peptide, n: int, how: RolloutConfig) -> None:
-    """Roll a peptide `n` times into a folder of its own, unless it is there."""
-    outs = [folder / peptide.name / f"run_{k:03d}.h5" for k in range(n)]
-    if not all(out.exists() for out in outs):
-        outs[0].parent.mkdir(parents=True, exist_ok=True)
-        rollout(build_peptide(peptide.sequence), start, outs, how, overwrite=True)
-
-
-def rolled_in_water(start: Weights, folder: Path) -> Path:
-    """Roll every residue between caps, and as many pairs, in TIP3P, and return the folder with a folder of each."""
-    water = [p for kind, p, number in order(TIP3P) if (kind, number) == ("train", 0) and p.capped]
-    for n in (1, 2):
-        for peptide in [p for p in water if len(p.residues) == n][: len(RESIDUES)]:
-            rolled_peptide(start, folder, peptide, _ROLLOUTS, _ROLLED)
+def rolled_in_water(start: Weights, folder: Path, peptides: Sequence[Peptide], n: int, how: RolloutConfig) -> Path:
+    """Roll each peptide `n` times and return the folder with a folder of each; what is there stays."""
+    for peptide in peptides:
+        outs = [folder / peptide.name / f"run_{k:03d}.h5" for k in range(n)]
+        if not all(out.exists() for out in outs):
+            outs[0].parent.mkdir(parents=True, exist_ok=True)
+            rollout(build_peptide(peptide.sequence), start, outs, how, overwrite=True)
     return folder
 
 
-def rehearsed(start: Weights, folder: Path) -> Path:
-    """Roll every molecule that weights were trained on in their first solvent, and return the folder."""
-    own = start.domain.conditions.get("solvent")
-    members = [replace(m, further=()) for m in start.domain.members if m.conditions.get("solvent") == own]
-    for k, names in enumerate(dict.fromkeys(names for member in members for names in member.peptides)):
-        residues = tuple(name for name in names if name not in ("ACE", "NME"))
-        peptide = Peptide(residues, capped=len(residues) < len(names), n_starts=0, time_ps=0.0)
-        rolled_peptide(start, folder, peptide, _REHEARSALS, _REHEARSED[k % len(_REHEARSED)])
-    return folder
+def in_water(start: Weights) -> list[Peptide]:
+    """Return residues and pairs between caps of the campaign in water, and the pairs with free ends that weights know
+    there."""
+    known = {"-".join(m.scene.residue_names) for m in start.domain.members if m.conditions.get("solvent") == TIP3P}
+    some = [p for kind, p, number in order(TIP3P) if (kind, number) == ("train", 0) and len(p.residues) <= 2]
+    return [p for p in some if p.capped or p.sequence in known]
+
+
+def train_lags(start: Weights, energies: dict[str, float], out: Path, steps: int | None) -> None:
+    """Write weights whose probabilities in TIP3P lead by any longer steps where those by steps of 10 ps do."""
+    peptides = in_water(start)
+    long, short = (
+        tuple(sets_of([rolled_in_water(start, out.with_name(f"{out.stem}-{how.lag_ps:g}ps"), peptides, n, how)]))
+        for n, how in (AGREEING, STAYING)
+    )
+    training = PeptideTraining(steps=steps, time_reversal=True, positive_phi_kt=energies, tuned="states",
+                               validate_every_s=_VALIDATE_S)  # fmt: skip
+    trained = out.with_stem(f"{out.stem}-trained")
+    of = FrameSets(long, rehearsed=short)
+    found = load_weights(train_peptides(of, trained, PeptideConfig(), training, start=start, resume=True))
+    # Rollouts are nothing that weights could cover.
+    save_weights(out, found.model, start.domain, provenance_of({}, {"tuned": "lags", "steps": steps}, start), half=True)
 
 
 def with_levels(
@@ -135,26 +143,29 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("out", type=Path)
     parser.add_argument("--train", type=Path, nargs="+")
     parser.add_argument("--start")
-    parser.add_argument("--tuned", choices=(*TUNED, *LEVELS), default="all")
+    parser.add_argument("--tuned", choices=(*TUNED, *dict.fromkeys((*LEVELS, *ALONE))), default="all")
     parser.add_argument("--coupled", action="store_true")
-    parser.add_argument("--rehearse", action="store_true")
     parser.add_argument("--runs", type=int, default=10_000)
     parser.add_argument("--unseen", type=int, default=0)
     parser.add_argument("--budget", type=lambda text: parse_wall_s(text, "--budget"))
     parser.add_argument("--steps", type=int)
     parser.add_argument("--half", action="store_true")
     a = parser.parse_args(arguments)
-    if a.tuned in LEVELS and a.start is None:
+    if a.tuned in (*LEVELS, *ALONE) and a.start is None:
         parser.error(f"--tuned {a.tuned} goes on from weights: name them by --start.")
-    if a.rehearse and a.start is None:
-        parser.error("--rehearse keeps what weights know: name them by --start.")
-    if a.tuned != "transfer" and not a.train:
+    if a.tuned not in ALONE and not a.train:
         parser.error("name the folders of runs by --train.")
     if is_trained(a.out):
         return
     start = None if a.start is None else load_weights(weights_path(a.start))
+    energies = known_energies(a.out.parent) or trained_with(None if start is None else start.provenance)
+    if a.tuned == "lags" and start is not None:
+        train_lags(start, energies, a.out, a.steps)
+        return
     if a.tuned == "transfer" and start is not None:
-        a.train = [rolled_in_water(start, a.out.with_name(f"{a.out.stem}-rollouts"))]
+        capped = [p for p in in_water(start) if p.capped]
+        some = [p for n in (1, 2) for p in [p for p in capped if len(p.residues) == n][: len(RESIDUES)]]
+        a.train = [rolled_in_water(start, a.out.with_name(f"{a.out.stem}-rollouts"), some, *TAKING_OVER)]
     sets = sets_of(a.train, a.runs)
     names = {id(frames): "-".join(frames.scene.residue_names) for frames in sets}
     alone = {f"ACE-{residue}-NME" for residue in RESIDUES}
@@ -164,7 +175,6 @@ def main(arguments: Sequence[str] | None = None) -> None:
     sets = [frames for frames in sets if names[id(frames)] not in left]
     total_us = sum(frames.total_ps for frames in sets) * 1e-6
     sys.stdout.write(f"{len(sets)} sets of runs, {total_us:.3g} µs; left out: {', '.join(left) or 'none'}\n")
-    energies = known_energies(a.out.parent) or trained_with(None if start is None else start.provenance)
     if a.tuned in LEVELS and start is not None:
         with_levels(sets, start, energies, a.out, a.tuned)
         return
@@ -173,8 +183,6 @@ def main(arguments: Sequence[str] | None = None) -> None:
         validate_every_s=_VALIDATE_S,
     )  # fmt: skip
     of = FrameSets(tuple(sets), tuple(unseen))
-    if a.rehearse and start is not None:
-        of = of._replace(rehearsed=tuple(sets_of([rehearsed(start, a.out.with_name("rehearsed"))])))
     train_peptides(of, a.out, PeptideConfig(coupled=a.coupled), training, start=start, resume=True)
     if a.half:
         found = load_weights(a.out)

@@ -1,7 +1,10 @@
 """Weights for peptides on molecules that they never saw, beside MD of these.
 
-    python docs/studies/training/peptide_unseen.py FOLDER --weights W --test CAMPAIGN/test [--solvent tip3p]
+    python docs/studies/training/peptide_unseen.py FOLDER --weights W [--test CAMPAIGN/test] [--solvent tip3p]
           [--library CAMPAIGN/train] [--molecules NAME ...] [-o TABLE.json]
+
+Without `--test` MD is the record of its torsions (`peptide_reference`), in OBC2, and what needs its frames is left out:
+the equivalent MD time and MDGen's recipe.
 
 Of each molecule the weights roll as many runs as MD has, each from the first frame of one of these, as long as MD's but
 10 ns at most, unguarded, at lags of 10 ps, 100 ps and 1 ns as far as training had them (FOLDER/NAME; what is there is
@@ -34,6 +37,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 from peptide_campaign import IMPLICIT, WATER, dynamics, minimised
+from peptide_reference import RECORD, Reference, references
 from peptide_rollouts import FRAMES_PS, frame_weights, rolled, thinned
 from peptide_scores import Turn, angles, library, rarely_positive, turns_of
 from peptide_transfer import trained_with
@@ -60,7 +64,7 @@ from systems.trajectory.codec import open_trajectory
 FloatArray = npt.NDArray[np.float64]
 # Runs of torsions in rad, `(n_frames, n_torsions)` each.
 Runs = Sequence[FloatArray]
-RUN_PS, LAGS_PS, BINS, JOINT_BINS, HALVES, SEED = 10_000.0, (100.0, 1000.0), 50, 36, 10, 0
+LAGS_PS, BINS, JOINT_BINS, HALVES, SEED = (100.0, 1000.0), 50, 36, 10, 0
 # By so many steps the pace of MD is measured; it is that of steps of 4 fs, as the runs have.
 PACE_STEPS, TIMESTEP_PS = {"obc2": 5000, "tip3p": 500}, 0.004
 # Columns of the first table; the others make a second one.
@@ -173,21 +177,14 @@ def worst(md_files: Sequence[Path], rollouts: Sequence[Path]) -> tuple[float, st
     return (math.nan, "-") if least is None else (least.equivalent_ps * 1e-3, least.in_words())
 
 
-def bought(scene: Scene, frame_nm: FloatArray, md_file: Path, rollout: Path) -> float:
-    """Return the time of MD, ps of each of sixteen replicas, that a core simulates in the wall time of a rollout."""
-    return pace(scene, frame_nm, md_file) * spent_s(rollout)
-
-
 def spent_s(rollout: Path) -> float:
     """Return the wall time of a rollout, of one in a batch its share of that."""
     with open_trajectory(rollout) as reader:
         return float(reader.record["cost"]["wall_s"])
 
 
-def pace(scene: Scene, frame_nm: FloatArray, md_file: Path) -> float:
-    """Return how much MD a core simulates now, ps of all replicas a second, by some steps."""
-    with open_trajectory(md_file) as reader:
-        solvent = reader.record["solvent"]
+def pace(scene: Scene, frame_nm: FloatArray, solvent: str) -> float:
+    """Return how much MD in a solvent a core simulates now, ps of all replicas a second, by some steps."""
     here, spec = scene.with_positions(frame_nm), IMPLICIT
     if solvent == WATER.solvent:
         here, spec = solvate(replace(here, cell_nm=None), WATER, WaterBox()), WATER
@@ -257,29 +254,25 @@ def farthest_state(turns: Sequence[Turn], residues: Sequence[str], md: Runs, of:
 
 
 def molecule(
-    weights: Weights, runs: Sequence[Path], folder: Path, solvent: str | None,
-    monomers: Path | None = None,
-) -> dict[str, Any]:  # fmt: skip
+    weights: Weights, reference: Reference, folder: Path, solvent: str | None, monomers: Path | None = None
+) -> dict[str, Any]:
     """Roll a molecule and return its line of the table."""
-    scene, md_nm, time_ps = thinned(runs)
-    time_ps = min(time_ps, RUN_PS)
-    md_nm = [x[: round(time_ps / FRAMES_PS)] for x in md_nm]
+    scene, time_ps, starts_nm = reference.scene, reference.time_ps, reference.starts_nm
 
     def files(lag_ps: float) -> list[Path]:
-        return [folder / f"{lag_ps:g}ps-{k:02d}.h5" for k in range(len(runs))]
+        return [folder / f"{lag_ps:g}ps-{k:02d}.h5" for k in range(len(starts_nm))]
 
     def roll(lag_ps: float) -> list[FloatArray]:
-        return rolled(weights, scene, files(lag_ps), time_ps, lag_ps, solvent, np.stack([x[0] for x in md_nm]))
+        return rolled(weights, scene, files(lag_ps), time_ps, lag_ps, solvent, starts_nm)
 
     own_nm = roll(FRAMES_PS)
     longest_ps = under_conditions(weights, {"solvent": solvent}).domain.longest_lag_ps
     lags = [lag for lag in LAGS_PS if lag <= min(time_ps / 2, longest_ps)]
     fitted, _ = fit_weights(scene, weights, lag_ps=FRAMES_PS, force=True, solvent=solvent)
     geometry = Geometry.from_dict(fitted.domain.geometry)
-    valid = [100.0 * float(np.mean([((check_frames(x, geometry) & INVALID) == 0).mean() for x in some]))
-             for some in (md_nm, own_nm)]  # fmt: skip
+    valid = 100.0 * float(np.mean([((check_frames(x, geometry) & INVALID) == 0).mean() for x in own_nm]))
     turns = turns_of(scene)
-    md, of = ([angles(turns, x) for x in some] for some in (md_nm, own_nm))
+    md, of = reference.torsions, [angles(turns, x) for x in own_nm]
     rare = rarely_positive(turns, md)
     counted = [[(~x).astype(np.float64) for x in shown(some, rare)] for some in (md, of)]
     kept = [k for k, both in enumerate(zip(*counted, strict=True)) if min(x.mean() for x in both) >= 0.5]
@@ -291,7 +284,7 @@ def molecule(
     amino_acids = [name for name in scene.residue_names if name not in ("ACE", "NME")]
     one = densities(md, counted[0]), densities(of, counted[1])
     joint = (joint_densities(md, counted[0], pairs), joint_densities(of, counted[1], pairs)) if pairs else None
-    md_ps = bought(scene, md_nm[0][-1], runs[0], files(FRAMES_PS)[0])
+    md_ps = pace(scene, starts_nm[0], reference.solvent) * spent_s(files(FRAMES_PS)[0])
     first = max(1, round(md_ps / FRAMES_PS))
     others: dict[str, Runs] = {f"MD of {len(md) * md_ps * 1e-3:.2g} ns": [x[:first] for x in md]}
     drawn = monomers and of_monomers(turns, amino_acids, monomers, trained_with(weights.provenance), md)
@@ -307,16 +300,17 @@ def molecule(
             name: over(pooled, one[0], densities(x, [(~there).astype(np.float64) for there in shown(x, rare)]))
             for name, x in others.items()
         },
-        "equivalent MD time": worst(runs, files(FRAMES_PS)),
+        "equivalent MD time": worst(reference.files, files(FRAMES_PS)) if reference.files else (math.nan, "-"),
         "MD's own, single": float(single(one[0], one[0]).mean()),
         "farthest state": farthest_state(turns, amino_acids, md, of, rare),
         "rare φ > 0": [f"{turns[k].kind} {turns[k].residue}" for k in rare],
         "kinetics": kinetics(usual, never(of, rare), psi),
         "kinetics of MD's halves": kinetics(usual[::2], usual[1::2], psi),
-        "MDGen's recipe": published(scene, md_nm, own_nm) if len(psi) == 3 and len(amino_acids) == 4 else None,
+        "MDGen's recipe": published(scene, reference.frames_nm, own_nm)
+        if len(psi) == 3 and len(amino_acids) == 4 and reference.files else None,
         "lags": lag_errors(md, of, {lag: [angles(turns, x) for x in roll(lag)] for lag in lags}),
-        "valid, %: MD, model": valid,
-    }
+        "valid, %": valid,
+    }  # fmt: skip
 
 
 def summary(rows: dict[str, dict[str, Any]]) -> list[str]:
@@ -337,11 +331,12 @@ def summary(rows: dict[str, dict[str, Any]]) -> list[str]:
                 f"populations at {lag:g} ps: {np.mean(found):.2f} of what MD's halves differ, at most {max(found):.2f}"
             )
     found = [row["equivalent MD time"][0] for row in rows.values()]
-    lines.append(f"equivalent MD time by the worst measure: median {np.nanmedian(found):.3g} ns")
+    if not np.isnan(found).all():
+        lines.append(f"equivalent MD time by the worst measure: median {np.nanmedian(found):.3g} ns")
     tables = [row["MDGen's recipe"] for row in rows.values() if row["MDGen's recipe"]]
     for column in TABLE if tables else ():
         lines.append(f"MDGen's recipe, {column}: {np.nanmean([one[column][2] for one in tables]):.2f} of {len(tables)}")
-    lines.append(f"valid: {np.mean([row['valid, %: MD, model'][1] for row in rows.values()]):.2f} %")
+    lines.append(f"valid: {np.mean([row['valid, %'] for row in rows.values()]):.2f} %")
     return lines
 
 
@@ -375,25 +370,26 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folder", type=Path)
     parser.add_argument("--weights", required=True)
-    parser.add_argument("--test", type=Path, required=True)
+    parser.add_argument("--test", type=Path, default=RECORD)
     parser.add_argument("--solvent")
     parser.add_argument("--library", type=Path)
     parser.add_argument("--molecules", nargs="+")
     parser.add_argument("-o", "--out", type=Path)
     a = parser.parse_args(arguments)
     weights, rows = load_weights(weights_path(a.weights)), {}
-    for place in sorted(a.test.iterdir()):
-        runs = sorted(place.glob("run_*.h5"))
-        if len(runs) < 4 or (a.molecules and place.name not in a.molecules):
+    for reference in references(a.test):
+        name = reference.name
+        if a.molecules and name not in a.molecules:
             continue
-        rows[place.name] = molecule(weights, runs, a.folder / place.name, a.solvent, a.library)
-        sys.stdout.write(f"{place.name}: {json.dumps(rows[place.name], ensure_ascii=False)}\n")
+        rows[name] = molecule(weights, reference, a.folder / name, a.solvent, a.library)
+        sys.stdout.write(f"{name}: {json.dumps(rows[name], ensure_ascii=False)}\n")
         sys.stdout.flush()
     if not rows:
-        raise SystemExit(f"{a.test} holds no molecule with four runs or more.")
+        raise SystemExit(f"{a.test} holds none of {', '.join(a.molecules)}.")
     sys.stdout.write("\n".join(summary(rows)) + "\n")
     if a.out is not None:
-        given = [f"--weights {a.weights}", "--test CAMPAIGN/test", *(["--solvent", a.solvent] if a.solvent else []),
+        given = [f"--weights {a.weights}", *([] if a.test == RECORD else ["--test CAMPAIGN/test"]),
+                 *(["--solvent", a.solvent] if a.solvent else []),
                  *(["--library CAMPAIGN/train"] if a.library else [])]  # fmt: skip
         lines = [table_row(*each) for each in rows.items()]
         columns = list(lines[0])

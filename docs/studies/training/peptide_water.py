@@ -84,7 +84,7 @@ def simulated_ns(folder: Path, runs: int) -> float:
 
 class Molecule(NamedTuple):
     """A molecule that is tested by: its scene in water, torsions, runs of MD in water and in OBC2 as torsions
-    `(n_frames, n_torsions)` in rad, the first frames in water, how long a run is, and the file of one."""
+    `(n_frames, n_torsions)` in rad, the first frames in water, and how long a run is."""
 
     name: str
     scene: Scene
@@ -93,7 +93,6 @@ class Molecule(NamedTuple):
     in_obc2: list[FloatArray]
     starts_nm: FloatArray
     time_ps: float
-    md_file: Path
 
     @classmethod
     def of(cls, water: Path, obc2: Path | None, name: str) -> Molecule:
@@ -102,7 +101,7 @@ class Molecule(NamedTuple):
         turns, dry = turns_of(scene), [] if obc2 is None else sorted((obc2 / "test" / name).glob("run_*.h5"))
         implicit = thinned(dry)[1] if dry else []
         md, in_obc2 = ([angles(turns, x) for x in some] for some in (frames, implicit))
-        return cls(name, scene, turns, md, in_obc2, np.stack([x[0] for x in frames]), time_ps, files[0])
+        return cls(name, scene, turns, md, in_obc2, np.stack([x[0] for x in frames]), time_ps)
 
     @property
     def residues(self) -> list[str]:
@@ -181,7 +180,7 @@ class Tests(NamedTuple):
     def of(cls, water: Path, obc2: Path | None = None) -> Tests:
         found = [Molecule.of(water, obc2, place.name) for place in sorted((water / "test").iterdir())
                  if len(list(place.glob("run_*.h5"))) >= 4]  # fmt: skip
-        return cls(found, {m.name: pace(m.scene, m.starts_nm[0], m.md_file) for m in found})
+        return cls(found, {m.name: pace(m.scene, m.starts_nm[0], "tip3p") for m in found})
 
     def even(self, some: Sequence[list[FloatArray]]) -> list[tuple[Molecule, list[FloatArray], list[FloatArray]]]:
         return [(m, runs, [np.ones(len(x)) for x in runs]) for m, runs in zip(self.molecules, some, strict=True)]
