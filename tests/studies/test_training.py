@@ -46,6 +46,7 @@ from surrogate.models.peptides.layout import chain_features
 from surrogate.models.peptides.model import PeptideSlide
 from surrogate.models.weights import Weights, load_weights
 from systems.chemistry.geometry import torsion
+from systems.chemistry.graph import backbone_torsions
 from systems.errors import InputError
 from systems.prepare.peptide import build_peptide
 from systems.trajectory.codec import open_trajectory
@@ -222,6 +223,11 @@ def test_longer_steps_in_water_are_learned_from_shorter_ones_alone(
     assert moved == {"jumps_elsewhere"}
     with pytest.raises(SystemExit):
         peptide_transfer.main([str(tmp_path / "x.safetensors"), "--tuned", "lags", "--steps", "4"])
+    scene = build_peptide("ACE-LEU-PRO-SER-NME")
+    starts = peptide_transfer.some_positive_phi(scene, 12)
+    phi = np.degrees(torsion(starts, backbone_torsions(scene)["phi"]))
+    assert [np.flatnonzero(phi[:, k] > 0).tolist() for k in range(3)] == [[0, 8], [], [4]]
+    np.testing.assert_allclose(phi[[0, 4, 8], [0, 2, 0]], 57.0)
 
 
 def test_md_of_tests_is_told_by_its_torsions(tmp_path: Path) -> None:

@@ -21,8 +21,9 @@ TIP3P on its own rollouts by steps of 10 ps, so that longer steps lead where the
 from __future__ import annotations
 
 import argparse
+import math
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, cast
@@ -42,8 +43,11 @@ from surrogate.models.peptides.subjects import PeptideSubject
 from surrogate.models.peptides.trainer import TUNED, PeptideTraining, peptides_domain, train_peptides
 from surrogate.models.weights import Weights, load_weights, provenance_of, save_weights
 from surrogate.sampling.runner import RolloutConfig, rollout
+from systems.chemistry.geometry import torsion
+from systems.chemistry.graph import backbone_torsions, bonded_graph, turned
 from systems.errors import InputError
 from systems.prepare.peptide import build_peptide
+from systems.scene import FloatArray, Scene
 from systems.units import parse_wall_s
 
 _VALIDATE_S = 300.0
@@ -52,11 +56,12 @@ _HELD_FRAMES = 20
 TIP3P = "tip3p"
 _ROLLED = RolloutConfig(time_ps=5000.0, lag_ps=10.0, solvent=TIP3P, seed=3, guard="off", force=True)
 # Rollouts of each molecule by which TIP3P takes over the probabilities of OBC2; by which longer steps agree with those
-# of 10 ps; and by which shorter ones stay.
+# of 10 ps, every fourth of which begins at a φ > 0, which is hardly ever entered; and by which shorter ones stay.
 TAKING_OVER, AGREEING, STAYING = (
     (4, _ROLLED), (16, replace(_ROLLED, time_ps=6000.0, seed=5)),
     (16, replace(_ROLLED, time_ps=60.0, lag_ps=1.0, seed=6)),
 )  # fmt: skip
+_POSITIVE_EVERY, _POSITIVE_RAD = 4, math.radians(57.0)
 # What is set to what runs show, without training.
 LEVELS = {"pace": set_pace, "transfer": transfer}
 # What goes on from weights without MD.
@@ -89,14 +94,30 @@ def trained_with(provenance: dict[str, Any] | None) -> dict[str, float]:
     return {}
 
 
-def rolled_in_water(start: Weights, folder: Path, peptides: Sequence[Peptide], n: int, how: RolloutConfig) -> Path:
+def rolled_in_water(
+    start: Weights, folder: Path, peptides: Sequence[Peptide], n: int, how: RolloutConfig,
+    starts: Callable[[Scene, int], FloatArray] | None = None,
+) -> Path:  # fmt: skip
     """Roll each peptide `n` times and return the folder with a folder of each; what is there stays."""
     for peptide in peptides:
         outs = [folder / peptide.name / f"run_{k:03d}.h5" for k in range(n)]
         if not all(out.exists() for out in outs):
             outs[0].parent.mkdir(parents=True, exist_ok=True)
-            rollout(build_peptide(peptide.sequence), start, outs, how, overwrite=True)
+            scene = build_peptide(peptide.sequence)
+            rollout(scene, start, outs, how, starts_nm=starts and starts(scene, n), overwrite=True)
     return folder
+
+
+def some_positive_phi(scene: Scene, n: int) -> FloatArray:
+    """Return positions `(n, n_atoms, 3)` as built, in some of which one φ after the other is turned to where it is
+    positive."""
+    found, graph = np.repeat(scene.positions_nm[None], n, axis=0), bonded_graph(scene)
+    quads = [q for q in backbone_torsions(scene)["phi"].tolist()
+             if scene.residue_names[scene.residue_of_atom[q[2]]] != "PRO"]  # fmt: skip
+    for turn, k in enumerate(range(0, n if quads else 0, _POSITIVE_EVERY)):
+        quad = quads[turn % len(quads)]
+        found[k] = turned(found[k], quad, _POSITIVE_RAD - float(torsion(found[k], [quad])[0]), graph)
+    return found
 
 
 def in_water(start: Weights) -> list[Peptide]:
@@ -111,7 +132,15 @@ def train_lags(start: Weights, energies: dict[str, float], out: Path, steps: int
     """Write weights whose probabilities in TIP3P lead by any longer steps where those by steps of 10 ps do."""
     peptides = in_water(start)
     long, short = (
-        tuple(sets_of([rolled_in_water(start, out.with_name(f"{out.stem}-{how.lag_ps:g}ps"), peptides, n, how)]))
+        tuple(
+            sets_of(
+                [
+                    rolled_in_water(
+                        start, out.with_name(f"{out.stem}-{how.lag_ps:g}ps"), peptides, n, how, some_positive_phi
+                    )
+                ]
+            )
+        )
         for n, how in (AGREEING, STAYING)
     )
     training = PeptideTraining(steps=steps, time_reversal=True, positive_phi_kt=energies, tuned="states",
