@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import json
 import math
 import re
 from collections import Counter
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import lag_errors
 import numpy as np
@@ -49,6 +51,7 @@ from systems.chemistry.geometry import torsion
 from systems.chemistry.graph import backbone_torsions
 from systems.errors import InputError
 from systems.prepare.peptide import build_peptide
+from systems.scene import Scene
 from systems.trajectory.codec import open_trajectory
 
 
@@ -228,6 +231,21 @@ def test_longer_steps_in_water_are_learned_from_shorter_ones_alone(
     phi = np.degrees(torsion(starts, backbone_torsions(scene)["phi"]))
     assert [np.flatnonzero(phi[:, k] > 0).tolist() for k in range(3)] == [[0, 8], [], [4]]
     np.testing.assert_allclose(phi[[0, 4, 8], [0, 2, 0]], 57.0)
+
+
+def test_populations_by_longer_steps_are_off_beyond_what_rollouts_err_by(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    def by_rollouts(weights: Weights, solvent: str, scene: Scene, folder: Path, lag_ps: float) -> tuple[Any, Any]:
+        moved = {10.0: 0.0, 30.0: 0.03, 100.0: 0.1}[lag_ps] if solvent == "tip3p" else 0.0
+        return [], {(1, "ψ"): (np.array([0.5 + moved, 0.5 - moved]), np.array([0.03, 0.04]) / math.sqrt(2.0))}
+
+    monkeypatch.setattr(peptide_populations, "by_rollouts", by_rollouts)
+    peptide_populations.main(["lags", str(tmp_path), "-o", str(out := tmp_path / "lags.json")])
+    wet, dry = json.loads(out.read_text("utf-8"))["rows"]
+    # The root of (0.1² - 0.03² + 0.1² - 0.04²) / 2.
+    assert wet[1:3] == ["0.0", "9.4"] and dry[1:3] == ["0.0", "0.0"]
+    assert wet[3] == "ψ of LEU in LEU-SER: 50 ± 2 and 60 ± 2" and dry[3] == ""
 
 
 def test_md_of_tests_is_told_by_its_torsions(tmp_path: Path) -> None:

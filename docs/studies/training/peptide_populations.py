@@ -4,6 +4,7 @@
     python docs/studies/training/peptide_populations.py set OUT.safetensors --start WEIGHTS
     python docs/studies/training/peptide_populations.py left-out FOLDER [--start WEIGHTS]
     python docs/studies/training/peptide_populations.py table FOLDER [--earlier WEIGHTS]
+    python docs/studies/training/peptide_populations.py lags FOLDER [--earlier WEIGHTS]
 
 WATER is a folder of `peptide_campaign --umbrella`. `gather` writes the populations of psi and of side chains to
 `water_populations.tsv`, a line for each torsion of each batch of runs: in per cent of the frames with every phi
@@ -12,7 +13,8 @@ else is kept of this MD, and the campaign leaves out what the table holds. `set`
 the table's, those of molecules that weights are tested on aside (`balance.population_levels`), in the mean over
 rollouts, and again as rollouts of the new weights show. `left-out` says how far the logarithms of ratios of populations
 are from the table's, of each molecule as others set them. `table` lays those of the tests beside rollouts by the
-shipped weights and by earlier ones.
+shipped weights and by earlier ones. `lags` says how far populations by longer steps are from those by steps of 10 ps,
+of pairs that no training saw.
 """
 
 from __future__ import annotations
@@ -24,6 +26,7 @@ import sys
 from collections.abc import Sequence
 from dataclasses import replace
 from itertools import combinations
+from operator import itemgetter
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
@@ -60,6 +63,7 @@ TIP3P, SHIPPED = "tip3p", "peptides"
 # psi crosses, the time between frames.
 ROLLOUTS, ROLLED_PS, LEFT_OUT_PS, LAG_PS, FINE_LAG_PS = 16, 30_000.0, 2_000.0, 20.0, 10.0
 PASSES = 3
+LONGER_PS = (30.0, 100.0)
 # Between states lie so many degrees on either side of their ends.
 CORE_DEG = 25.0
 
@@ -294,26 +298,77 @@ def left_out(folder: Path, start: Weights) -> None:
         sys.stdout.write(f"{words}: " + ", ".join(f"{name} {off_by(part):.2f}" for name, part in parts) + "\n")
 
 
+def ways_of(earlier: str | None) -> dict[str, tuple[Any, str]]:
+    """Return which weights in which solvent, by what they are called in tables."""
+    ways: dict[str, tuple[Any, str]] = {"earlier ones": (earlier, TIP3P)} if earlier else {}
+    return ways | {f"`{SHIPPED}`": (SHIPPED, TIP3P), f"`{SHIPPED}` in OBC2": (SHIPPED, "obc2")}
+
+
+def by_rollouts(
+    weights: Weights, solvent: str, scene: Scene, folder: Path, lag_ps: float
+) -> tuple[list[npt.NDArray[np.floating]], dict[tuple[int, str], tuple[FloatArray, FloatArray]]]:
+    """Return rollouts of a molecule, which lie in a folder, without their beginnings, and populations by these."""
+    assert isinstance(weights.model, PeptideSlide)
+    place = folder / f"{weights.path.stem}-{weights.hash[:8]}-{solvent}" / scene.name
+    outs = [place / f"{lag_ps:g}ps-{k:02d}.h5" for k in range(ROLLOUTS)]
+    runs = rolled(weights, scene, outs, ROLLED_PS, lag_ps, solvent)
+    runs = [x[round(LEFT_OUT_PS / lag_ps) :] for x in runs]
+    return runs, populations(scene, chain_features(scene, weights.model.config, solvent), runs)
+
+
+def lag_table(folder: Path, earlier: str | None, out: Path) -> None:
+    """Say how far populations by longer steps are from those by short ones, root mean square over states, less what
+    rollouts err by."""
+    pairs = ["-".join(p.residues) for p in unseen_peptides() if p.capped and len(p.residues) == 2]
+    lines = []
+    for way, (name, solvent) in ways_of(earlier).items():
+        weights, square = load_weights(weights_path(str(name))), np.zeros(len(LONGER_PS))
+        n, farthest = 0, (0.0, "")
+        for pair in pairs:
+            scene = build_peptide(f"ACE-{pair}-NME")
+            short, *long = (by_rollouts(weights, solvent, scene, folder, lag)[1] for lag in (FINE_LAG_PS, *LONGER_PS))
+            for at, (shares, errors) in short.items():
+                others = [each[at] for each in long]
+                square += [((x - shares) ** 2 - e**2 - errors**2).sum() for x, e in others]
+                n += len(shares)
+                k = int(np.abs(others[-1][0] - shares).argmax())
+                words = f"{at[1]} of {pair.split('-')[at[0] - 1]} in {pair}: {percent(shares[k], errors[k])} and " + (
+                    percent(others[-1][0][k], others[-1][1][k])
+                )
+                farthest = max(farthest, (abs(float(others[-1][0][k] - shares[k])), words), key=itemgetter(0))
+        lines.append([way, *(f"{100.0 * math.sqrt(max(0.0, x / n)):.1f}" for x in square), farthest[1]])
+        sys.stdout.write(" | ".join(lines[-1]) + "\n")
+    note = (
+        f"{len(pairs)} capped pairs that no training saw; {ROLLOUTS} rollouts of {1e-3 * ROLLED_PS:g} ns of each at "
+        f"each step, without their first {1e-3 * LEFT_OUT_PS:g}."
+    )
+    columns = ["", *(f"by steps of {lag:g} ps, %" for lag in LONGER_PS),
+               f"farthest by {LONGER_PS[-1]:g} ps, %, of a state by {FINE_LAG_PS:g} ps"]  # fmt: skip
+    write_table(out, columns, lines, "lags", earlier, note)
+
+
+def write_table(
+    out: Path, columns: Sequence[str], lines: Sequence[Sequence[str]], what: str, earlier: str | None, note: str
+) -> None:
+    words = " --earlier EARLIER.safetensors" if earlier else ""
+    about = {"command": f"python docs/studies/training/peptide_populations.py {what} FOLDER{words}",
+             "machine": machine_name(), "note": note}  # fmt: skip
+    table = {"columns": columns, "rows": lines, **about}
+    out.write_text(json.dumps(table, ensure_ascii=False, indent=1) + "\n", "utf-8")
+
+
 def make_table(folder: Path, earlier: str | None, out: Path) -> None:
     """Lay the tests' populations beside those of rollouts, and say how often psi crosses."""
     known = {t.molecule for t in learned()}
     torsions = together([t for t in read() if t.molecule not in known])
-    ways: dict[str, tuple[Any, str]] = {"earlier ones": (earlier, TIP3P)} if earlier else {}
-    ways |= {f"`{SHIPPED}`": (SHIPPED, TIP3P), f"`{SHIPPED}` in OBC2": (SHIPPED, "obc2")}
-    rows: dict[str, list[str]] = {}
+    ways, rows = ways_of(earlier), dict[str, list[str]]()
     off: dict[str, list[float]] = {way: [] for way in ways}
     for molecule in dict.fromkeys(t.molecule for t in torsions):
         scene = build_peptide(f"ACE-{molecule}-NME")
         turns, names = turns_of(scene), ("", *molecule.split("-"))
         for way, (name, solvent) in ways.items():
             weights = load_weights(weights_path(str(name)))
-            assert isinstance(weights.model, PeptideSlide)
-            chain = chain_features(scene, weights.model.config, solvent)
-            outs = [folder / f"{weights.path.stem}-{weights.hash[:8]}-{solvent}" / molecule / f"{k:02d}.h5"
-                    for k in range(ROLLOUTS)]  # fmt: skip
-            runs = rolled(weights, scene, outs, ROLLED_PS, FINE_LAG_PS, solvent)
-            runs = [x[round(LEFT_OUT_PS / FINE_LAG_PS) :] for x in runs]
-            found = populations(scene, chain, runs)
+            runs, found = by_rollouts(weights, solvent, scene, folder, FINE_LAG_PS)
             for t in (t for t in torsions if t.molecule == molecule):
                 for k, state in enumerate(("strand", "helix") if t.name == "ψ" else ("gauche+", "trans", "gauche-")):
                     shares, errors = found[t.at]
@@ -335,11 +390,7 @@ def make_table(folder: Path, earlier: str | None, out: Path) -> None:
         f"{'; '.join(lengths.values())}. Rollouts: {ROLLOUTS} of {1e-3 * ROLLED_PS:g} ns, without their first "
         f"{1e-3 * LEFT_OUT_PS:g}. By Markov models; the error of all states is the root mean square, less MD's own."
     )
-    words = " --earlier EARLIER.safetensors" if earlier else ""
-    about = {"command": f"python docs/studies/training/peptide_populations.py table FOLDER{words}",
-             "machine": machine_name(), "note": note}  # fmt: skip
-    table = {"columns": ["", "MD in TIP3P", *ways], "rows": lines, **about}
-    out.write_text(json.dumps(table, ensure_ascii=False, indent=1) + "\n", "utf-8")
+    write_table(out, ["", "MD in TIP3P", *ways], lines, "table", earlier, note)
     sys.stdout.write("\n".join(" | ".join(line) for line in lines) + "\n")
 
 
@@ -349,14 +400,15 @@ def percent(share: float, error: float) -> str:
 
 def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("what", choices=("gather", "set", "left-out", "table"))
+    parser.add_argument("what", choices=("gather", "set", "left-out", "table", "lags"))
     parser.add_argument("path", type=Path)
     parser.add_argument("--start", default=SHIPPED)
     parser.add_argument("--earlier")
-    parser.add_argument("-o", "--out", type=Path, default=TABLES / "peptides_water_shipped.json")
+    parser.add_argument("-o", "--out", type=Path)
     a = parser.parse_args(arguments)
-    if a.what == "table":
-        make_table(a.path, a.earlier, a.out)
+    if a.what in ("table", "lags"):
+        make, name = (make_table, "shipped") if a.what == "table" else (lag_table, "lags")
+        make(a.path, a.earlier, a.out or TABLES / f"peptides_water_{name}.json")
         return
     start = load_weights(weights_path(a.start))
     if a.what == "set":
