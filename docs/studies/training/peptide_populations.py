@@ -34,7 +34,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 import torch
-from peptide_list import held_out_peptides, unseen_peptides
+from peptide_list import TEST_PAIRS, held_out_peptides, unseen_peptides
 from peptide_rollouts import rolled
 from peptide_scores import angles, psi_crossings, turns_of
 from processes import is_trained
@@ -319,7 +319,7 @@ def by_rollouts(
 def lag_table(folder: Path, earlier: str | None, out: Path) -> None:
     """Say how far populations by longer steps are from those by short ones, root mean square over states, less what
     rollouts err by."""
-    pairs = ["-".join(p.residues) for p in unseen_peptides() if p.capped and len(p.residues) == 2]
+    pairs = ["-".join(pair) for pair in TEST_PAIRS]
     lines = []
     for way, (name, solvent) in ways_of(earlier).items():
         weights, square = load_weights(weights_path(str(name))), np.zeros(len(LONGER_PS))

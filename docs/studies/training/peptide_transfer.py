@@ -132,21 +132,13 @@ def train_lags(start: Weights, energies: dict[str, float], out: Path, steps: int
     """Write weights whose probabilities in TIP3P lead by any longer steps where those by steps of 10 ps do."""
     peptides = in_water(start)
     long, short = (
-        tuple(
-            sets_of(
-                [
-                    rolled_in_water(
-                        start, out.with_name(f"{out.stem}-{how.lag_ps:g}ps"), peptides, n, how, some_positive_phi
-                    )
-                ]
-            )
-        )
+        rolled_in_water(start, out.with_name(f"{out.stem}-{how.lag_ps:g}ps"), peptides, n, how, some_positive_phi)
         for n, how in (AGREEING, STAYING)
     )
+    of = FrameSets(tuple(sets_of([long])), rehearsed=tuple(sets_of([short])))
     training = PeptideTraining(steps=steps, time_reversal=True, positive_phi_kt=energies, tuned="states",
                                validate_every_s=_VALIDATE_S)  # fmt: skip
     trained = out.with_stem(f"{out.stem}-trained")
-    of = FrameSets(long, rehearsed=short)
     found = load_weights(train_peptides(of, trained, PeptideConfig(), training, start=start, resume=True))
     # Rollouts are nothing that weights could cover.
     save_weights(out, found.model, start.domain, provenance_of({}, {"tuned": "lags", "steps": steps}, start), half=True)
@@ -172,7 +164,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("out", type=Path)
     parser.add_argument("--train", type=Path, nargs="+")
     parser.add_argument("--start")
-    parser.add_argument("--tuned", choices=(*TUNED, *dict.fromkeys((*LEVELS, *ALONE))), default="all")
+    parser.add_argument("--tuned", choices=(*TUNED, *LEVELS, "lags"), default="all")
     parser.add_argument("--coupled", action="store_true")
     parser.add_argument("--runs", type=int, default=10_000)
     parser.add_argument("--unseen", type=int, default=0)
@@ -180,7 +172,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--steps", type=int)
     parser.add_argument("--half", action="store_true")
     a = parser.parse_args(arguments)
-    if a.tuned in (*LEVELS, *ALONE) and a.start is None:
+    if a.tuned not in TUNED and a.start is None:
         parser.error(f"--tuned {a.tuned} goes on from weights: name them by --start.")
     if a.tuned not in ALONE and not a.train:
         parser.error("name the folders of runs by --train.")

@@ -126,9 +126,7 @@ def train_peptides(
         measured = [*range(len(known.token_mean)), *(measured if training.tuned == "all" else ())]
     _fill_unseen(model, measured)
     if training.time_reversal:
-        subjects, rehearsed = (
-            [subject.in_equilibrium(training.positive_phi_kt) for subject in some] for some in (subjects, rehearsed)
-        )
+        subjects = [subject.in_equilibrium(training.positive_phi_kt) for subject in subjects]
     of_jumps = {"all": JUMPS_SHARE, "flow": 0.0, "states": 1.0}[training.tuned]
     flow_s, jumps_s = (
         None if training.budget_s is None else share * training.budget_s for share in (1 - of_jumps, of_jumps)
@@ -201,7 +199,7 @@ def train_peptides(
             for name, share, dropped in (("jumps", 1 - _ENDING_SHARE, _DROPPED), ("ending", _ENDING_SHARE, 0.0)):
                 stage = replace(of_states.part(share), name=name)
                 yield Stage(model.all_jumps, stage, partial(jumps_loss, dropped=dropped), partial(validate, stage))
-            balance(model, [*subjects, *rehearsed])
+            balance(model, subjects)
 
     train_stages(in_turn(), out, write, device=device, resume=resume, progress=progress)
     return out
