@@ -36,6 +36,9 @@ _LARGEST = 20.0
 # How many jumps between any two frames each run stands for, its beginning and its end; a frame's probabilities to take
 # part grow with this power of its place in its run.
 _JUMPS_A_RUN, _LATE = 2.0, 2
+# Where a Markov model fails, cells whose frames come so many times later than the earliest cell's, or less, weigh
+# nothing.
+_LEFT = 3.0
 _CONVERGED, _MOST_ITERATIONS = 1e-6, 20_000
 _CLUSTER_SEED = 1
 
@@ -87,9 +90,7 @@ def _cells(runs: Sequence[FloatArray], lag_frames: int) -> list[npt.NDArray[np.i
 
 def _of_cells(cells: Sequence[npt.NDArray[np.int32]], lag_frames: int) -> FloatArray:
     """Return what a frame of each cell weighs `(n_cells,)`."""
-    from deeptime.markov import TransitionCountEstimator, TransitionCountModel
-    from deeptime.markov.msm import MaximumLikelihoodMSM
-    from deeptime.util.exceptions import NotConvergedWarning
+    from deeptime.markov import TransitionCountEstimator
 
     counted = TransitionCountEstimator(lagtime=lag_frames, count_mode="sliding", sparse=False).fit(list(cells))
     counts = np.asarray(counted.fetch_model().count_matrix, dtype=np.float64)
@@ -97,17 +98,32 @@ def _of_cells(cells: Sequence[npt.NDArray[np.int32]], lag_frames: int) -> FloatA
     late = np.asarray(np.bincount(np.concatenate(cells), weights=lateness, minlength=len(counts)), dtype=np.float64)
     # Transitions are counted once at each frame of the lag, and so are the jumps.
     counts += _JUMPS_A_RUN * len(cells) * lag_frames * np.outer(late, late) / late.sum() ** 2
-    visited = np.flatnonzero(late > 0)
+    visited, found = np.flatnonzero(late > 0), None
+    while found is None:
+        try:
+            found = _stationary(counts[np.ix_(visited, visited)])
+        except RuntimeError:
+            # States that runs begin in and leave at once, one after the other, are unlikely beyond what numbers hold.
+            visited = visited[late[visited] > _LEFT * late[visited].min()]
+    n_frames = np.bincount(np.concatenate(cells), minlength=len(counts))
+    weights = np.zeros(len(counts))
+    weights[visited] = found / n_frames[visited]
+    return weights
+
+
+def _stationary(counts: FloatArray) -> FloatArray:
+    """Return the stationary distribution `(n,)` of the reversible Markov model of counts `(n, n)`. Raises RuntimeError
+    where parts of it underflow."""
+    from deeptime.markov import TransitionCountModel
+    from deeptime.markov.msm import MaximumLikelihoodMSM
+    from deeptime.util.exceptions import NotConvergedWarning
+
     with warnings.catch_warnings():
         # What is left to converge after so many iterations is nothing beside the scatter of counts.
         warnings.simplefilter("ignore", NotConvergedWarning)
-        model = MaximumLikelihoodMSM(reversible=True, maxerr=_CONVERGED, maxiter=_MOST_ITERATIONS).fit(
-            TransitionCountModel(counts[np.ix_(visited, visited)])
-        )
-    n_frames = np.bincount(np.concatenate(cells), minlength=len(counts))
-    weights = np.zeros(len(counts))
-    weights[visited] = model.fetch_model().stationary_distribution / n_frames[visited]
-    return weights
+        model = MaximumLikelihoodMSM(reversible=True, maxerr=_CONVERGED, maxiter=_MOST_ITERATIONS)
+        found = model.fit(TransitionCountModel(counts)).fetch_model().stationary_distribution
+    return np.asarray(found, dtype=np.float64)
 
 
 # Share of windows whose frames are evenly spaced, as in rollouts; the others' times are drawn one by one.
