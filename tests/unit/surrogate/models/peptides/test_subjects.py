@@ -143,3 +143,13 @@ def test_rare_states_and_changes_come_oftener_and_probabilities_stay_what_they_a
         assert probabilities[1] == pytest.approx(probabilities[0], rel=0.12), (torsion, state)
         if state == 0:
             assert shares[1] > 5 * shares[0], "changes come oftener, and would be overrated if all counted alike"
+
+
+def test_states_that_runs_only_begin_in_weigh_next_to_nothing() -> None:
+    """One run goes through many of them, one after the other: products of its odds underflow."""
+    rng = np.random.default_rng(0)
+    cells = [(12 + (rng.random(600) < 0.5)).astype(np.int32) for _ in range(16)]
+    cells[0][:60] = np.repeat(np.arange(12), 5)
+    weights = equilibrium._of_cells(cells, 5)
+    assert (weights[:12] < 1e-3 * weights[12:].min()).all() and (weights[:2] == 0.0).all()
+    np.testing.assert_allclose(weights[12] / weights[13], 1.0, rtol=0.1)
