@@ -13,7 +13,8 @@ molecules of several residues one is left out, and the curves show its loss. `--
 energies of φ > 0 are those of `peptide_energies` beside OUT, or those that the weights gone on from were trained with.
 A training that was stopped goes on. These take no MD: `transfer` gives TIP3P the probabilities of OBC2, as often as
 its own have it (`balance.transfer`), in the mean over rollouts in it, which lie beside OUT; `lags` trains those of
-TIP3P on its own rollouts by steps of 10 ps, so that longer steps lead where these do, and keeps those of shorter steps.
+TIP3P on its own rollouts by steps of 10 ps, so that longer steps lead where these do, and keeps those of these and of
+shorter ones.
 `pace` sets how often ψ changes its state beside other residues to what runs show (`balance.set_pace`). Populations:
 `peptide_populations`.
 """
@@ -62,6 +63,8 @@ TAKING_OVER, AGREEING, STAYING = (
     (16, replace(_ROLLED, time_ps=60.0, lag_ps=1.0, seed=6)),
 )  # fmt: skip
 _POSITIVE_EVERY, _POSITIVE_RAD = 4, math.radians(57.0)
+# Frames of a piece, a few more than a chunk's and a divisor of a run's; and a rate by which what is known stays.
+_PIECE, _STAYING_RATE = 20, 4e-4
 # What is set to what runs show, without training.
 LEVELS = {"pace": set_pace, "transfer": transfer}
 # What goes on from weights without MD.
@@ -135,9 +138,12 @@ def train_lags(start: Weights, energies: dict[str, float], out: Path, steps: int
         rolled_in_water(start, out.with_name(f"{out.stem}-{how.lag_ps:g}ps"), peptides, n, how, some_positive_phi)
         for n, how in (AGREEING, STAYING)
     )
-    of = FrameSets(tuple(sets_of([long])), rehearsed=tuple(sets_of([short])))
-    training = PeptideTraining(steps=steps, time_reversal=True, positive_phi_kt=energies, tuned="states",
-                               validate_every_s=_VALIDATE_S)  # fmt: skip
+    agreeing, staying = sets_of([long]), sets_of([short])
+    # Cut into pieces they hold no longer steps.
+    staying += [replace(f, starts=np.arange(0, f.n_frames + 1, _PIECE), split=Split(0.1 / _PIECE)) for f in agreeing]
+    training = PeptideTraining(steps=steps, learning_rate=_STAYING_RATE, time_reversal=True, positive_phi_kt=energies,
+                               tuned="states", validate_every_s=_VALIDATE_S)  # fmt: skip
+    of = FrameSets(tuple(agreeing), rehearsed=tuple(staying))
     trained = out.with_stem(f"{out.stem}-trained")
     found = load_weights(train_peptides(of, trained, PeptideConfig(), training, start=start, resume=True))
     # Rollouts are nothing that weights could cover.
