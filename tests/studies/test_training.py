@@ -220,7 +220,7 @@ def test_longer_steps_in_water_are_learned_from_shorter_ones_alone(
     out = tmp_path / "w.safetensors"
     peptide_transfer.main([str(out), "--start", "peptides", "--tuned", "lags", "--steps", "4"])
     start, found = load_weights(weights_path("peptides")), load_weights(out)
-    assert found.domain.peptides == start.domain.peptides and found.provenance["from"]["tuned"] == "populations"
+    assert found.domain.peptides == start.domain.peptides and found.provenance["tuned"] == "lags"
     after = found.model.state_dict()
     moved = {name.split(".")[0] for name, x in start.model.state_dict().items() if not torch.equal(x, after[name])}
     assert moved == {"jumps_elsewhere"}

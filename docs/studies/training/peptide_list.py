@@ -132,7 +132,7 @@ def unseen_peptides() -> tuple[Peptide, ...]:
     pairs, capped = (*TEST_PAIRS, *UNSEEN_PAIRS), (*TEST_CHAINS, *UNSEEN_CHAINS)
     free = (*UNSEEN_FREE, TEST_FREE_CHAINS[0], *unseen_tetrapeptides())
     some = (
-        *(Peptide(pair, True, _TEST_STARTS, 20_000.0) for pair in pairs),
+        *(Peptide(pair, True, _TEST_STARTS, 10_000.0) for pair in pairs),
         *(Peptide((residue,), True, _TEST_STARTS, 20_000.0) for residue in (*TEST_MONOMERS, "TYR")),
         *(Peptide(chain, True, _TEST_STARTS, 10_000.0) for chain in capped),
         *(Peptide(chain, False, _TEST_STARTS, 10_000.0) for chain in free),
