@@ -440,12 +440,10 @@ class StrideSampler(NamedTuple):
 
 class FrameSets(NamedTuple):
     """Frames of several molecules. Those `trained` on hold their own validation stretches; those of `unseen` are held
-    out whole: curves are measured on them, and nothing is learned from them. Those `rehearsed` are of rollouts of the
-    weights that a training goes on from, which it is to stay near to."""
+    out whole: curves are measured on them, and nothing is learned from them."""
 
     trained: tuple[TrainingFrames, ...]
     unseen: tuple[TrainingFrames, ...] = ()
-    rehearsed: tuple[TrainingFrames, ...] = ()
 
     @property
     def names(self) -> str:

@@ -483,6 +483,8 @@ def under_conditions(weights: Weights, asked: Mapping[str, Any]) -> Weights:
     if solvent != model.solvent and isinstance(model, PeptideSlide) and model.config.solvents:
         model = copy.copy(model)
         model.solvent = solvent
+        if solvent != model.config.solvents[0]:
+            model.usual_lag_ps = model.usual_lag_elsewhere_ps
     return (
         weights if domain is weights.domain and model is weights.model else replace(weights, model=model, domain=domain)
     )

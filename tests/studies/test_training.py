@@ -15,7 +15,6 @@ import lag_errors
 import numpy as np
 import peptide_campaign
 import peptide_correction
-import peptide_list
 import peptide_populations
 import peptide_reference
 import peptide_runs
@@ -48,7 +47,6 @@ from surrogate.models.peptides.layout import chain_features
 from surrogate.models.peptides.model import PeptideSlide
 from surrogate.models.weights import Weights, load_weights
 from systems.chemistry.geometry import torsion
-from systems.chemistry.graph import backbone_torsions
 from systems.errors import InputError
 from systems.prepare.peptide import build_peptide
 from systems.scene import Scene
@@ -209,35 +207,11 @@ def test_a_rare_positive_phi_plays_no_part() -> None:
     assert len(peptide_unseen.never(md, [0])) == 8, "too few are without"
 
 
-def test_longer_steps_in_water_are_learned_from_shorter_ones_alone(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    """What is known in OBC2, the flow and what weights cover stay; nothing but rollouts is read."""
-    one = [peptide_list.Peptide(("ALA",), True, 0, 0.0)]
-    monkeypatch.setattr(peptide_transfer, "in_water", lambda start: one)
-    for name, time_ps in (("AGREEING", 600.0), ("STAYING", 60.0)):
-        monkeypatch.setattr(peptide_transfer, name, (2, replace(getattr(peptide_transfer, name)[1], time_ps=time_ps)))
-    out = tmp_path / "w.safetensors"
-    peptide_transfer.main([str(out), "--start", "peptides", "--tuned", "lags", "--steps", "4"])
-    start, found = load_weights(weights_path("peptides")), load_weights(out)
-    assert found.domain.peptides == start.domain.peptides and found.provenance["tuned"] == "lags"
-    after = found.model.state_dict()
-    moved = {name.split(".")[0] for name, x in start.model.state_dict().items() if not torch.equal(x, after[name])}
-    assert moved == {"jumps_elsewhere"}
-    with pytest.raises(SystemExit):
-        peptide_transfer.main([str(tmp_path / "x.safetensors"), "--tuned", "lags", "--steps", "4"])
-    scene = build_peptide("ACE-LEU-PRO-SER-NME")
-    starts = peptide_transfer.some_positive_phi(scene, 12)
-    phi = np.degrees(torsion(starts, backbone_torsions(scene)["phi"]))
-    assert [np.flatnonzero(phi[:, k] > 0).tolist() for k in range(3)] == [[0, 8], [], [4]]
-    np.testing.assert_allclose(phi[[0, 4, 8], [0, 2, 0]], 57.0)
-
-
 def test_populations_by_longer_steps_are_off_beyond_what_rollouts_err_by(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     def by_rollouts(weights: Weights, solvent: str, scene: Scene, folder: Path, lag_ps: float) -> tuple[Any, Any]:
-        moved = {10.0: 0.0, 30.0: 0.03, 100.0: 0.1}[lag_ps] if solvent == "tip3p" else 0.0
+        moved = {10.0: 0.0, 20.0: 0.03, 100.0: 0.1}[lag_ps] if solvent == "tip3p" else 0.0
         return [], {(1, "ψ"): (np.array([0.5 + moved, 0.5 - moved]), np.array([0.03, 0.04]) / math.sqrt(2.0))}
 
     monkeypatch.setattr(peptide_populations, "by_rollouts", by_rollouts)

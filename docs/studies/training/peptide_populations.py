@@ -63,7 +63,7 @@ TIP3P, SHIPPED = "tip3p", "peptides"
 # psi crosses, the time between frames.
 ROLLOUTS, ROLLED_PS, LEFT_OUT_PS, LAG_PS, FINE_LAG_PS = 16, 30_000.0, 2_000.0, 20.0, 10.0
 PASSES = 3
-LONGER_PS = (30.0, 100.0)
+LONGER_PS = (20.0, 100.0)
 # Between states lie so many degrees on either side of their ends.
 CORE_DEG = 25.0
 

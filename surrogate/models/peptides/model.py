@@ -12,7 +12,6 @@ overlap, are mended by small turns; chunks with frames where that is not enough 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
 from functools import partial
 from typing import ClassVar, NamedTuple, cast
 
@@ -167,19 +166,6 @@ class StateJumps(nn.Module):
         MOST_TORSIONS): what each torsion's change counts in a window, 1 where it is not given; `kept` (b, 1, r, width):
         factors of hidden numbers.
         """
-        total = observed.new_zeros(())
-        for torsion, has, logits in self.of_windows(observed, states, places, counts, times_ps, apart_ps, kept):
-            chosen = states[:, 1:, has, torsion]
-            each = F.cross_entropy(logits.flatten(0, -2), chosen.flatten(), reduction="none").reshape(chosen.shape)
-            total = total + (each if share is None else share[:, None, has, torsion] * each).sum()
-        return total / (times_ps.numel() * max(1, int((counts > 0).sum())))
-
-    def of_windows(
-        self, observed: Tensor, states: Tensor, places: Tensor, counts: Tensor, times_ps: Tensor, apart_ps: Tensor,
-        kept: Tensor | float = 1.0,
-    ) -> Iterator[tuple[int, Tensor, Tensor]]:  # fmt: skip
-        """Yield each torsion, the residues `(n,)` that have it, and the logits `(b, t, n, MOST_STATES)` of its new
-        states in windows as `loss` takes them."""
         with torch.autocast(observed.device.type, enabled=False):
             before, new = states[:, :-1], states[:, 1:]
             earlier = torch.cat([before[:, :1], before[:, :-1]], dim=1)
@@ -188,11 +174,16 @@ class StateJumps(nn.Module):
             h = h + of_times[:, :, None] + self.of_observed(observed, states[:, 0], places, counts)[:, None]
             conditioning = conditioning_states(new, counts)
             h = kept * (h + self.of_new_states(conditioning))
+            total = observed.new_zeros(())
             for torsion in torch.nonzero((counts > 0).any(0))[:, 0].tolist():
                 has = torch.nonzero(counts[:, torsion])[:, 0]
+                now, chosen = before[..., has, torsion], new[..., has, torsion]
                 earlier_torsions = conditioning[..., : torsion * MOST_STATES].index_select(2, has)
-                own = h.index_select(2, has), levels.index_select(3, has), before[..., has, torsion], earlier_torsions
-                yield torsion, has, self.probabilities(torsion, *own)
+                own = h.index_select(2, has), levels.index_select(3, has), now, earlier_torsions
+                logits = self.probabilities(torsion, *own)
+                each = F.cross_entropy(logits.flatten(0, -2), chosen.flatten(), reduction="none").reshape(chosen.shape)
+                total = total + (each if share is None else share[:, None, has, torsion] * each).sum()
+            return total / (times_ps.numel() * max(1, int((counts > 0).sum())))
 
     def draw(
         self, observed: Tensor, states: Tensor, places: Tensor, counts: Tensor, times_ps: Tensor, apart_ps: Tensor,
@@ -402,6 +393,8 @@ class PeptideSlide(Propagator):
     arch: ClassVar[str] = "lam-slide-peptides"
     float32_layers: tuple[str, ...] = ("flow.of_time", "jumps")
     usual_lag_ps: float | None = 100.0
+    # Rarer by a factor, changes are right for steps that are short beside the time in which a torsion relaxes.
+    usual_lag_elsewhere_ps: float | None = 20.0
     config: PeptideConfig
 
     def __init__(self, config: PeptideConfig) -> None:

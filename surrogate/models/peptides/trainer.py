@@ -28,7 +28,7 @@ from surrogate.models.peptides.layout import (
     standard_peptide,
     unknown_coordinates,
 )
-from surrogate.models.peptides.model import PeptideSlide, StateJumps, times_apart
+from surrogate.models.peptides.model import PeptideSlide, times_apart
 from surrogate.models.peptides.subjects import PeptideSubject, StateWindows
 from surrogate.models.weights import (
     TrainingDomain,
@@ -86,36 +86,34 @@ class PeptideTraining:
 
 
 def train_peptides(
-    sets: Sequence[TrainingFrames] | FrameSets, out: str | Path, config: PeptideConfig, training: PeptideTraining, *,
-    start: Weights | None = None, resume: bool = False, progress: ProgressFn | None = None,
+    sets: Sequence[TrainingFrames], out: str | Path, config: PeptideConfig, training: PeptideTraining, *,
+    unseen: Sequence[TrainingFrames] = (), start: Weights | None = None, resume: bool = False,
+    progress: ProgressFn | None = None,
 ) -> Path:  # fmt: skip
     """Train on frames of several sequences and write `out` (.safetensors); beside it a CSV of the curves: first the
     flow, conditioned on the states of torsions, then the probabilities of these states, which share nothing with it.
 
-    `start`: weights to go on from, with their scales; a solvent that these do not know begins as their first. On frames
-    that are rehearsed the probabilities of states learn those of `start`: what it was trained on is forgotten less
-    (Robins 1995, Connection Science 7, 123). Sequences of several solvents make weights that take one.
+    `unseen`: sequences held out whole, whose loss the curves show. `start`: weights to go on from, with their scales;
+    a solvent that these do not know begins as their first. Sequences of several solvents make weights that take one.
     Raises InputError for scenes that are no chains, SimulationError when training diverges.
     """
-    out, of = Path(out), sets if isinstance(sets, FrameSets) else FrameSets(tuple(sets))
+    out = Path(out)
     torch.manual_seed(training.seed)
     if training.tuned not in TUNED:
         raise InputError(f"`tuned` is one of {', '.join(TUNED)}, not {training.tuned!r}.")
     if training.tuned != "all" and start is None:
         raise InputError(f"`tuned='{training.tuned}'` goes on from weights, most of which it keeps; give them.")
-    if of.rehearsed and start is None:
-        raise InputError("rollouts are rehearsed that weights to go on from have made; give these weights.")
     if start is not None:
         # Trained further, a flow forgets the few steps that it was distilled to.
         kept = start.model.config if training.tuned == "states" else config
         config = replace(start.model.config, usual_steps=kept.usual_steps, usual_solver=kept.usual_solver,
                          coupled=start.model.config.coupled or config.coupled)  # fmt: skip
-    config = with_scale(in_solvents(config, of.trained, start), of.trained)
+    config = with_scale(in_solvents(config, sets, start), sets)
     device = torch.device(training.device)
     model = PeptideSlide(config).to(device)
-    subjects, held_out, rehearsed = (
+    subjects, held_out = (
         [PeptideSubject(f, chain_features(f.scene, config, f.conditions.get("solvent")).to(device)) for f in some]
-        for some in of
+        for some in (sets, unseen)
     )
     normalise(model, subjects, training.seed)
     measured = [kind for subject in subjects for kind in model.kinds(subject.chain).tolist()]
@@ -148,20 +146,17 @@ def train_peptides(
         idx, times = subject.batch(training.batch, config, generator)
         return peptide_loss(model, subject.chain, *subject.seen(model, idx), times.to(device), generator)
 
-    pools: dict[PeptideSubject, StateWindows] = {}
+    pools: dict[int, StateWindows] = {}
 
     def jumps_loss(generator: torch.Generator, *, dropped: float) -> tuple[Tensor, dict[str, Tensor]]:
-        # Half of the steps, however many molecules there are.
-        again = bool(rehearsed) and bool(torch.rand(1, generator=generator) < 0.5)
-        subject = (some := rehearsed if again else subjects)[pick(some, generator)]
-        if subject not in pools:
-            pools[subject] = StateWindows.of(subject, config)
-        idx, times, share = pools[subject].draw(_JUMPS_BATCH, generator)
+        which = pick(subjects, generator)
+        subject = subjects[which]
+        if which not in pools:
+            pools[which] = StateWindows.of(subject, config)
+        idx, times, share = pools[which].draw(_JUMPS_BATCH, generator)
         observed = disturbed(subject.seen(model, idx[:, 0])[0], subject.chain, config, generator)
-        given = (observed, subject.states(idx).to(device), times.to(device), generator)
-        if again:
-            loss = rehearsal_loss(model, known, subject.chain, *given, dropped=dropped)
-            return loss, {"rehearsed": loss.detach()}
+        states = subject.states(idx).to(device)
+        given = (observed, states, times.to(device), generator)
         loss = state_loss(model, subject.chain, *given, share=share.to(device), dropped=dropped)
         return loss, {"jumps": loss.detach()}
 
@@ -182,15 +177,13 @@ def train_peptides(
                 found.setdefault(f"{name}_{key}", []).append(float(value))
         return {key: float(np.mean(values)) for key, values in found.items()}
 
-    domain = peptides_domain(
-        of.trained, config, start.domain if start is not None and training.tuned != "all" else None
-    )
+    domain = peptides_domain(sets, config, start.domain if start is not None and training.tuned != "all" else None)
 
     def write(spent_s: list[float]) -> None:
         settings: dict[str, Any] = {"seed": training.seed, "spent_s": round(sum(spent_s), 1)}
         if training.positive_phi_kt:
             settings["positive_phi_kt"] = training.positive_phi_kt
-        save_weights(out, model, domain, provenance_of(of.origin, settings, start))
+        save_weights(out, model, domain, provenance_of(FrameSets(tuple(sets)).origin, settings, start))
 
     def in_turn() -> Iterator[Stage]:
         if training.tuned != "states":
@@ -427,35 +420,11 @@ def state_loss(
     """Return the negative log-likelihood of the changes of states: `observed` (b, r, slots) the given frame's numbers,
     `states` (b, 1 + t, r, MOST_TORSIONS), `times_ps` (b, t), `share` (b, r, MOST_TORSIONS) what each change counts,
     1 where it is not given. `dropped`: the share of hidden numbers that are left out."""
-    jumps, kept = model.jumps_of(chain), _kept(model.jumps_of(chain), observed, dropped, generator)
+    jumps = model.jumps_of(chain)
+    drawn = torch.rand(len(observed), 1, observed.shape[1], jumps.hidden.in_features, generator=generator)
+    kept = ((drawn >= dropped) / (1 - dropped)).to(observed.device)
     apart = times_apart(times_ps, model.config.forgotten_ps)
     return jumps.loss(observed, states, chain.places, chain.stated.counts, times_ps, apart, share, kept)
-
-
-def rehearsal_loss(
-    model: PeptideSlide, teacher: PeptideSlide, chain: chains.ChainFeatures, observed: Tensor, states: Tensor,
-    times_ps: Tensor, generator: torch.Generator, *, dropped: float = 0.0,
-) -> Tensor:  # fmt: skip
-    """Return how far the probabilities of changes of states are from those of `teacher` (Kullback-Leibler divergence
-    per frame and torsion), in windows as `state_loss` takes them."""
-    jumps, known = model.jumps_of(chain), teacher.jumps_of(chain)
-    kept = _kept(jumps, observed, dropped, generator)
-    given = chain.places, chain.stated.counts, times_ps, times_apart(times_ps, model.config.forgotten_ps)
-    with torch.no_grad():
-        # Weights that know more coordinates have them after those of the teacher.
-        taught = list(known.of_windows(observed[..., : known.of_numbers.in_features], states, *given))
-    total = observed.new_zeros(())
-    for (*_, own), (*_, wanted) in zip(jumps.of_windows(observed, states, *given, kept), taught, strict=True):
-        # States that a torsion lacks are infinitely unlikely to both.
-        target, found = (x.log_softmax(-1).masked_fill(torch.isinf(wanted), 0.0) for x in (wanted, own))
-        total = total + (wanted.softmax(-1) * (target - found)).sum()
-    return total / (times_ps.numel() * max(1, int((chain.stated.counts > 0).sum())))
-
-
-def _kept(jumps: StateJumps, observed: Tensor, dropped: float, generator: torch.Generator) -> Tensor:
-    """Return the factors of hidden numbers, a share of them zero."""
-    drawn = torch.rand(len(observed), 1, observed.shape[1], jumps.hidden.in_features, generator=generator)
-    return ((drawn >= dropped) / (1 - dropped)).to(observed.device)
 
 
 def disturbed(
@@ -510,8 +479,7 @@ class PeptideTrainer(arch.Trainer):
                 advance(stage, low + share * (high - low))
 
             trained, unseen = (list(map(_under_standard_names, some)) for some in (sets.trained, sets.unseen))
-            of = FrameSets(tuple(trained), tuple(unseen))
-            return train_peptides(of, request.out, settings.model, settings.training, start=start,
+            return train_peptides(trained, request.out, settings.model, settings.training, unseen=unseen, start=start,
                                   resume=request.resume, progress=report)  # fmt: skip
 
         return arch.Prepared(sets.names, run)

@@ -10,10 +10,11 @@ import pytest
 import torch
 
 from surrogate.data import StrideSampler, TrainingFrames, strides_up_to
+from surrogate.models.architecture import weights_path
 from surrogate.models.lam_slide.model import LamSlideConfig
 from surrogate.models.lam_slide.trainer import TrainingConfig, train_lam_slide, window_frames
 from surrogate.models.weights import Weights, load_weights, save_weights
-from surrogate.sampling.domain import choose_lag, fit_weights
+from surrogate.sampling.domain import choose_lag, fit_weights, under_conditions
 from surrogate.sampling.runner import RolloutConfig, rollout
 from surrogate.sampling.simulation import Simulation
 from systems.errors import InputError
@@ -150,3 +151,10 @@ def test_longest_lags_that_the_frames_do_not_have_are_refused(
         with pytest.raises(InputError, match=why):
             train_lam_slide(harmonic_frames, tmp_path / "x.safetensors", small_model_config,
                             replace(QUICK, longest_lag_ps=longest))  # fmt: skip
+
+
+def test_steps_in_a_further_solvent_are_shorter_where_nothing_is_said() -> None:
+    weights = load_weights(weights_path("peptides"))
+    for solvent, lag_ps in ((None, 100.0), ("obc2", 100.0), ("tip3p", 20.0)):
+        meant = under_conditions(weights, {"solvent": solvent})
+        assert choose_lag(meant, None, 100.0) == lag_ps and choose_lag(meant, 50.0, 100.0) == 50.0

@@ -15,7 +15,7 @@ from torch import Tensor
 
 import surrogate as sm
 from small_scenes import with_phi_turned
-from surrogate.data import FrameSets, Split, TrainingFrames, canonicalise, quantise
+from surrogate.data import Split, TrainingFrames, canonicalise, quantise
 from surrogate.models.architecture import TrainingRequest
 from surrogate.models.peptides import subjects as peptide_subjects
 from surrogate.models.peptides import trainer as peptide_trainer
@@ -27,7 +27,6 @@ from surrogate.models.peptides.trainer import (
     PeptideTrainer,
     PeptideTraining,
     normalise,
-    rehearsal_loss,
     state_loss,
     train_peptides,
     with_scale,
@@ -419,33 +418,6 @@ def test_probabilities_of_states_or_the_flow_can_be_trained_alone(frames: Traini
     after = on.model.state_dict()
     moved = {name.split(".")[0] for name, tensor in before.items() if not torch.equal(tensor, after[name])}
     assert moved == {"flow"} and on.model.usual_steps == 6
-
-
-def test_what_weights_knew_of_states_stays_where_it_is_rehearsed(frames: TrainingFrames, tmp_path: Path) -> None:
-    """MD in which no torsion turns is trained on, where the weights begun with turn them often."""
-    start = load_weights(train_peptides([frames], tmp_path / "a.safetensors", SMALL, PeptideTraining(steps=2)))
-    with torch.no_grad():
-        start.model.jumps.logits.bias += 5.0
-    subject = PeptideSubject(frames, chain_features(frames.scene, start.model.config))
-    idx, times = subject.windows(64, start.model.config, torch.Generator().manual_seed(2))
-    observed, states = subject.seen(start.model, idx)
-
-    def apart(model: PeptideSlide) -> float:
-        given = subject.chain, observed[:, 0], states, times, torch.Generator().manual_seed(0)
-        return float(rehearsal_loss(model, start.model, *given))
-
-    def trained(*rehearsed: TrainingFrames) -> PeptideSlide:
-        alone = PeptideTraining(steps=60, tuned="states", learning_rate=1e-2, validate_every_s=1e9)
-        of = FrameSets((frames,), rehearsed=rehearsed)
-        return load_weights(train_peptides(of, tmp_path / "b.safetensors", SMALL, alone, start=start)).model
-
-    assert apart(start.model) == 0.0
-    forgot, kept = apart(trained()), apart(trained(frames))
-    assert 0.0 < kept < 0.5 * forgot
-    with pytest.raises(InputError, match="give these weights"):
-        train_peptides(
-            FrameSets((frames,), rehearsed=(frames,)), tmp_path / "c.safetensors", SMALL, PeptideTraining(steps=2)
-        )
 
 
 def test_weights_of_two_solvents_know_which_is_meant(frames: TrainingFrames, tmp_path: Path) -> None:
