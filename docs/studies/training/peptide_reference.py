@@ -4,7 +4,7 @@
 
 writes `unseen_torsions.npz`: of each molecule, the first 10 ns of each run, phi, psi and chi every 10 ps in steps of
 0.4 degrees, which parts all bins of `peptide_unseen` evenly, and the first frames. So weights can be laid beside MD
-that took hours of a core and is not kept.
+that took more than an hour of a core and is not kept.
 """
 
 from __future__ import annotations
