@@ -331,11 +331,11 @@ def lag_table(folder: Path, earlier: str | None, out: Path) -> None:
                 others = [each[at] for each in long]
                 square += [((x - shares) ** 2 - e**2 - errors**2).sum() for x, e in others]
                 n += len(shares)
-                k = int(np.abs(others[-1][0] - shares).argmax())
-                words = f"{at[1]} of {pair.split('-')[at[0] - 1]} in {pair}: {percent(shares[k], errors[k])} and " + (
-                    percent(others[-1][0][k], others[-1][1][k])
-                )
-                farthest = max(farthest, (abs(float(others[-1][0][k] - shares[k])), words), key=itemgetter(0))
+                last, its_errors = others[-1]
+                k = int(np.abs(last - shares).argmax())
+                both = f"{percent(shares[k], errors[k])} and {percent(last[k], its_errors[k])}"
+                words = f"{at[1]} of {pair.split('-')[at[0] - 1]} in {pair}: {both}"
+                farthest = max(farthest, (abs(float(last[k] - shares[k])), words), key=itemgetter(0))
         lines.append([way, *(f"{100.0 * math.sqrt(max(0.0, x / n)):.1f}" for x in square), farthest[1]])
         sys.stdout.write(" | ".join(lines[-1]) + "\n")
     note = (

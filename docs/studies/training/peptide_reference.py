@@ -3,8 +3,8 @@
     python docs/studies/training/peptide_reference.py CAMPAIGN/test
 
 writes `unseen_torsions.npz`: of each molecule, the first 10 ns of each run, phi, psi and chi every 10 ps in steps of
-0.4 degrees, which parts all bins of `peptide_unseen` evenly, and the first frames. So weights can be laid beside MD
-that took more than an hour of a core and is not kept.
+0.4 degrees, which parts all bins of `peptide_unseen` evenly, and the first frames. So rollouts can be compared with
+MD that took more than an hour of a core and is not kept.
 """
 
 from __future__ import annotations
@@ -55,7 +55,8 @@ class Reference(NamedTuple):
         frames = [x[: round(min(time_ps, RUN_PS) / FRAMES_PS)] for x in frames]
         with open_trajectory(files[0]) as reader:
             solvent = str(reader.record["solvent"])
-        torsions, starts = [angles(turns_of(scene), x) for x in frames], np.stack([x[0] for x in frames])
+        turns, starts = turns_of(scene), np.stack([x[0] for x in frames])
+        torsions = [angles(turns, x) for x in frames]
         return cls(files[0].parent.name, scene, solvent, torsions, starts, tuple(files), tuple(frames))
 
 

@@ -393,7 +393,7 @@ class PeptideSlide(Propagator):
     arch: ClassVar[str] = "lam-slide-peptides"
     float32_layers: tuple[str, ...] = ("flow.of_time", "jumps")
     usual_lag_ps: float | None = 100.0
-    # Rarer by a factor, changes are right for steps that are short beside the time in which a torsion relaxes.
+    # Changes that are rarer by a factor than in the first are right for steps short beside a torsion's relaxation.
     usual_lag_elsewhere_ps: float | None = 20.0
     config: PeptideConfig
 

@@ -34,6 +34,7 @@ UMBRELLA = Umbrella((tuple(PSI[0].tolist()),), ((3.0, -1.0, 0.5, 2.0),))
 CONFIG = MDConfig(
     time_ps=4.0, equilibrate_ps=1.0, seed=4, platform="simd", force=ForceFieldSpec("ff14SB", "obc2"), umbrella=UMBRELLA
 )
+HOT_K = 500.0
 needs_compiler = pytest.mark.skipif(not (shutil.which("g++") or shutil.which("c++")), reason="no C++ compiler")
 
 
@@ -98,13 +99,14 @@ def test_files_hold_the_energies_without_it_and_its_own(tmp_path: Path, platform
 
 @needs_compiler
 def test_weighted_frames_are_those_of_equilibrium(tmp_path: Path) -> None:
-    """ψ crosses more often, and its populations, weighted, are those of MD without an umbrella."""
-    long = replace(CONFIG, time_ps=700.0, equilibrate_ps=20.0)
+    """ψ crosses more often, and its populations, weighted, are those of MD without an umbrella: at 500 K, where
+    chance moves them apart by 0.02."""
+    long = replace(CONFIG, time_ps=1000.0, equilibrate_ps=20.0, temperature_k=HOT_K)
     plain = [tmp_path / f"plain{k}.h5" for k in range(n_replicas())]
     simulate_batch(SCENE, replace(long, umbrella=None), plain)
     psi = np.concatenate([np.asarray(torsion(x, PSI))[:, 0] for x in load_ensemble(plain).segments])
     bent = [tmp_path / f"bent{k}.h5" for k in range(n_replicas())]
-    found = Umbrella.of(PSI, psi[:, None], [1.0], 300.0)
+    found = Umbrella.of(PSI, psi[:, None], [1.0], HOT_K)
     simulate_batch(SCENE, replace(long, umbrella=found), bent)
     md = load_ensemble(bent)
     assert md.differences_kj_mol is not None
@@ -116,16 +118,12 @@ def test_weighted_frames_are_those_of_equilibrium(tmp_path: Path) -> None:
     own = [np.asarray(torsion(x, PSI))[:, 0] for x in md.segments]
     changes = [int(np.diff(strands(x).astype(int)).astype(bool).sum()) for x in (psi, np.concatenate(own))]
     assert changes[1] > 1.3 * changes[0]
-    each = frame_factors(md.differences_kj_mol, 300.0)
-    factors = np.concatenate(each)
+    factors = np.concatenate(frame_factors(md.differences_kj_mol, HOT_K))
     shares = [
         strands(psi).mean(), np.average(strands(np.concatenate(own)), weights=factors),
-        next(s.share for s in md_answer(md, 300.0).states if s.state == "β"),
+        next(s.share for s in md_answer(md, HOT_K).states if s.state == "β"),
     ]  # fmt: skip
-    of_runs = ([strands(x).mean() for x in np.split(psi, n_replicas())],
-               [np.average(strands(x), weights=w) for x, w in zip(own, each, strict=True)])  # fmt: skip
-    error = np.hypot(*(np.std(x, ddof=1) for x in of_runs)) / np.sqrt(n_replicas())
-    assert abs(shares[1] - shares[0]) < 3.0 * error < 0.15 and abs(shares[2] - shares[1]) < 0.05
+    assert np.abs(np.diff(shares)).max() < 0.05
     barrier = np.abs(np.rad2deg(np.concatenate(own)) - 75.0) < 25.0
     assert barrier.mean() > 1.5 * np.average(barrier, weights=factors), "unweighted they are not"
 
