@@ -9,12 +9,13 @@ from collections import Counter
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import lag_errors
 import numpy as np
 import peptide_campaign
 import peptide_correction
+import peptide_equilibrium
 import peptide_populations
 import peptide_reference
 import peptide_runs
@@ -26,6 +27,7 @@ import pytest
 import torch
 from peptide_correction import CELLS, Correction
 from peptide_energies import wham
+from peptide_equilibrium import Equilibrium, step, teach
 from peptide_list import (
     FURTHER_PAIRS,
     RESIDUES,
@@ -45,7 +47,7 @@ from surrogate.models.architecture import weights_path
 from surrogate.models.peptides.balance import Change
 from surrogate.models.peptides.layout import chain_features
 from surrogate.models.peptides.model import PeptideSlide
-from surrogate.models.weights import Weights, load_weights
+from surrogate.models.weights import Weights, load_weights, save_weights
 from systems.chemistry.geometry import torsion
 from systems.errors import InputError
 from systems.prepare.peptide import build_peptide
@@ -376,6 +378,33 @@ def test_a_correction_weighs_frames_by_their_residues_maps(monkeypatch: pytest.M
     found = Correction.of(tmp_path / "there", tmp_path / "here")
     assert found.clock == 1.5 and found.log_ratio.keys() == {"ALA"}
     assert found.log_ratio["ALA"] == pytest.approx(np.ones((CELLS, CELLS)))
+
+
+def test_weights_are_taught_to_keep_what_they_draw_at_endless_times(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """They begin with steps by which psi of alanine goes to its second state too often, and at endless times does not."""
+    for name, value in {"_FRAMES": 300, "_POOL": 2048, "_HELD": 1, "_RATE": 2e-2}.items():
+        monkeypatch.setattr(peptide_equilibrium, name, value)
+    shipped = load_weights(weights_path("peptides"))
+    begun = cast(PeptideSlide, load_weights(weights_path("peptides")).model)
+    with torch.no_grad():
+        begun.jumps.of_change[:, :, 1, 0, 1] += torch.tensor([2.0, -0.5])[:, None]
+    save_weights(start := tmp_path / "start.safetensors", begun, shipped.domain, {}, half=True)
+    taught = cast(PeptideSlide, load_weights(teach(start, tmp_path / "taught.safetensors", 1, 40)).model)
+    frames = Equilibrium.of(begun, "ACE-ALA-NME", seed=1)
+    rows = torch.arange(len(frames.states))
+
+    def of_psi(model: PeptideSlide, time_ps: float) -> float:
+        """How many more go to the second state than come back."""
+        found = step(model, begun, frames, rows, torch.tensor([time_ps]), torch.Generator().manual_seed(0))
+        return float(found.unbalanced[0])
+
+    assert of_psi(begun, 10.0) > 0.8 and abs(of_psi(taught, 10.0)) < 0.3
+    endless = begun.config.forgotten_ps
+    assert abs(of_psi(begun, endless)) < 0.3 and abs(of_psi(taught, endless) - of_psi(begun, endless)) < 0.1
+    moved = {k.split(".")[0] for k, x in taught.state_dict().items() if not torch.equal(x, begun.state_dict()[k])}
+    assert moved == {"jumps"}
 
 
 def test_populations_are_set_once_however_many_passes(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

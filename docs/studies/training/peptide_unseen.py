@@ -13,6 +13,8 @@ read). Over MD's own:
   MD (single), and of half of the runs to half of MD's (pooled); joint maps of ψ and the next φ (36 x 36) pooled;
 - kinetics: integrated correlation times of every cos ψ and along the two slowest TICA coordinates of MD;
 - lags: root mean square difference of the populations of torsion states at 100 ps and 1 ns from those at 10 ps;
+- populations of torsion states: root mean square difference from MD's, of rollouts, of frames that the weights draw
+  at endless times, each by itself, and of one half of MD's runs from the other;
 - free chains of four, by MDGen's recipe: every other run to the remaining runs of MD, the model's over MD's.
 A φ > 0 that MD enters fewer than ten times plays no part: frames that show it are left out of distances, as are pairs
 of runs one of which shows it half of the time, and runs that show it out of kinetics. How likely it is,
@@ -30,12 +32,14 @@ import math
 import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
+from copy import copy
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import numpy.typing as npt
+import torch
 from peptide_campaign import IMPLICIT, WATER, dynamics, minimised
 from peptide_reference import RECORD, Reference, references
 from peptide_rollouts import FRAMES_PS, frame_weights, rolled, thinned
@@ -55,6 +59,7 @@ from surrogate.comparison.read.ensemble import Ensemble
 from surrogate.comparison.rows.published_metrics import TABLE, fit_recipe, peptide_table
 from surrogate.models.architecture import weights_path
 from surrogate.models.peptides.chains import POSITIVE_PHI_DEG
+from surrogate.models.peptides.model import PeptideSlide
 from surrogate.models.weights import Weights, load_weights
 from surrogate.sampling.domain import fit_weights, under_conditions
 from systems.chemistry.validity import INVALID, Geometry, check_frames
@@ -65,6 +70,8 @@ FloatArray = npt.NDArray[np.float64]
 # Runs of torsions in rad, `(n_frames, n_torsions)` each.
 Runs = Sequence[FloatArray]
 LAGS_PS, BINS, JOINT_BINS, HALVES, SEED = (100.0, 1000.0), 50, 36, 10, 0
+# Frames after each start at endless times.
+ENDLESS = 200
 # By so many steps the pace of MD is measured; it is that of steps of 4 fs, as the runs have.
 PACE_STEPS, TIMESTEP_PS = {"obc2": 5000, "tip3p": 500}, 0.004
 # Columns of the first table; the others make a second one.
@@ -238,6 +245,26 @@ def lag_errors(md: Runs, at_10: Runs, others: dict[float, Runs]) -> dict[str, fl
             for lag, x in others.items()}  # fmt: skip
 
 
+def endless(weights: Weights, scene: Scene, starts_nm: FloatArray, solvent: str | None) -> list[FloatArray]:
+    """Return ENDLESS frames after each start, each drawn by itself when nothing is left of the start."""
+    fitted, _ = fit_weights(scene, weights, lag_ps=FRAMES_PS, force=True, solvent=solvent)
+    model = cast(PeptideSlide, copy(fitted.model))
+    model.lag_ps = model.config.forgotten_ps
+    frames = torch.from_numpy(starts_nm).float().repeat_interleave(ENDLESS, dim=0)[:, None]
+    noise = torch.randn(len(frames), *model.noise_shape(scene.n_atoms), generator=torch.Generator().manual_seed(SEED))
+    with torch.no_grad():
+        found = model.next_chunk(frames, model.featurise(scene), noise, solver_steps=model.usual_steps).frames_nm
+    return [x.double().numpy() for x in found[:, 0].split(ENDLESS)]
+
+
+def population_errors(md: Runs, others: Mapping[str, Runs]) -> dict[str, float]:
+    """Return how far populations of states are from MD's, of others and of MD's halves from each other, %."""
+    wells = [find_wells([x[:, k] for x in md]) for k in range(md[0].shape[1])]
+    pairs = {"MD's halves": (md[::2], md[1::2]), **{name: (x, md) for name, x in others.items()}}
+    return {name: 100.0 * float(np.sqrt(np.mean((populations(wells, a) - populations(wells, b)) ** 2)))
+            for name, (a, b) in pairs.items()}  # fmt: skip
+
+
 def farthest_state(turns: Sequence[Turn], residues: Sequence[str], md: Runs, of: Runs, rare: Sequence[int]) -> str:
     """Return the state of a torsion, but of `rare` ones, whose population is farthest from MD's, and both populations
     with standard errors over runs."""
@@ -291,6 +318,7 @@ def molecule(
     if drawn:
         others["library of monomers"] = drawn
     usual = never(md, rare)
+    at_endless = [angles(turns, x) for x in endless(weights, scene, starts_nm, solvent)]
     return {
         "frames": sum(map(len, md)),
         "torsions, single": over(single, *one),
@@ -309,6 +337,7 @@ def molecule(
         "MDGen's recipe": published(scene, reference.frames_nm, own_nm)
         if len(psi) == 3 and len(amino_acids) == 4 and reference.files else None,
         "lags": lag_errors(md, of, {lag: [angles(turns, x) for x in roll(lag)] for lag in lags}),
+        "populations, %": population_errors(md, {"rollouts": of, "endless times": at_endless}),
         "valid, %": valid,
     }  # fmt: skip
 
@@ -330,6 +359,9 @@ def summary(rows: dict[str, dict[str, Any]]) -> list[str]:
             lines.append(
                 f"populations at {lag:g} ps: {np.mean(found):.2f} of what MD's halves differ, at most {max(found):.2f}"
             )
+    errors = {what: np.sqrt(np.mean([row["populations, %"][what] ** 2 for row in rows.values()]))
+              for what in next(iter(rows.values()))["populations, %"]}  # fmt: skip
+    lines.append("populations off MD's: " + ", ".join(f"{what} {x:.1f} %" for what, x in errors.items()))
     found = [row["equivalent MD time"][0] for row in rows.values()]
     if not np.isnan(found).all():
         lines.append(f"equivalent MD time by the worst measure: median {np.nanmedian(found):.3g} ns")

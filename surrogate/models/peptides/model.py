@@ -12,6 +12,7 @@ overlap, are mended by small turns; chunks with frames where that is not enough 
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from functools import partial
 from typing import ClassVar, NamedTuple, cast
 
@@ -166,6 +167,19 @@ class StateJumps(nn.Module):
         MOST_TORSIONS): what each torsion's change counts in a window, 1 where it is not given; `kept` (b, 1, r, width):
         factors of hidden numbers.
         """
+        total = observed.new_zeros(())
+        for torsion, has, logits in self.of_windows(observed, states, places, counts, times_ps, apart_ps, kept):
+            chosen = states[:, 1:, has, torsion]
+            each = F.cross_entropy(logits.flatten(0, -2), chosen.flatten(), reduction="none").reshape(chosen.shape)
+            total = total + (each if share is None else share[:, None, has, torsion] * each).sum()
+        return total / (times_ps.numel() * max(1, int((counts > 0).sum())))
+
+    def of_windows(
+        self, observed: Tensor, states: Tensor, places: Tensor, counts: Tensor, times_ps: Tensor, apart_ps: Tensor,
+        kept: Tensor | float = 1.0,
+    ) -> Iterator[tuple[int, Tensor, Tensor]]:  # fmt: skip
+        """Yield each torsion, the residues `(n,)` that have it, and the logits `(b, t, n, MOST_STATES)` of its new
+        states in windows as `loss` takes them."""
         with torch.autocast(observed.device.type, enabled=False):
             before, new = states[:, :-1], states[:, 1:]
             earlier = torch.cat([before[:, :1], before[:, :-1]], dim=1)
@@ -174,16 +188,11 @@ class StateJumps(nn.Module):
             h = h + of_times[:, :, None] + self.of_observed(observed, states[:, 0], places, counts)[:, None]
             conditioning = conditioning_states(new, counts)
             h = kept * (h + self.of_new_states(conditioning))
-            total = observed.new_zeros(())
             for torsion in torch.nonzero((counts > 0).any(0))[:, 0].tolist():
                 has = torch.nonzero(counts[:, torsion])[:, 0]
-                now, chosen = before[..., has, torsion], new[..., has, torsion]
                 earlier_torsions = conditioning[..., : torsion * MOST_STATES].index_select(2, has)
-                own = h.index_select(2, has), levels.index_select(3, has), now, earlier_torsions
-                logits = self.probabilities(torsion, *own)
-                each = F.cross_entropy(logits.flatten(0, -2), chosen.flatten(), reduction="none").reshape(chosen.shape)
-                total = total + (each if share is None else share[:, None, has, torsion] * each).sum()
-            return total / (times_ps.numel() * max(1, int((counts > 0).sum())))
+                own = h.index_select(2, has), levels.index_select(3, has), before[..., has, torsion], earlier_torsions
+                yield torsion, has, self.probabilities(torsion, *own)
 
     def draw(
         self, observed: Tensor, states: Tensor, places: Tensor, counts: Tensor, times_ps: Tensor, apart_ps: Tensor,
@@ -491,6 +500,24 @@ class PeptideSlide(Propagator):
         rho = self.correlation_at(times_ps, kinds)
         return rho * observed[:, None] + (1.0 - rho.square()).sqrt() * y
 
+    def solved(
+        self, observed: Tensor, now: Tensor, states: Tensor, times_ps: Tensor, chain: ChainFeatures, drawn: Tensor, *,
+        solver: str, solver_steps: int,
+    ) -> tuple[Tensor, int]:  # fmt: skip
+        """Return coordinates `(b, t, r, slots)`, as `ChainCode.encode` gives them, at `times_ps` (b, t) after a frame
+        with numbers `observed` (b, r, slots) and states `now` (b, r, MOST_TORSIONS), in `states` (b, t, r,
+        MOST_TORSIONS), from noise `drawn` (b, t, r, slots); and how often the flow was evaluated."""
+        of_states = conditioning_states(torch.cat([now[:, None], states], dim=1), chain.stated.counts)
+        conditioning, evaluations = self.flow.conditioning(observed, times_ps, chain.places, of_states), 0
+
+        def predict(o: Tensor, tau: Tensor) -> Tensor:
+            nonlocal evaluations
+            evaluations += 1
+            return torch.where(chain.code.filled, self.flow(o, tau, conditioning), 0.0)
+
+        y = flow.SOLVERS[solver](predict, drawn, solver_steps)
+        return self._tokens(self.from_innovations(y, observed, times_ps, self.kinds(chain)), states, chain), evaluations
+
     def noise_shape(self, n_atoms: int) -> tuple[int, ...]:
         # At least as many numbers as a frame has coordinates that vary.
         return (self.n_new, n_atoms, 4)
@@ -525,17 +552,10 @@ class PeptideSlide(Propagator):
 
         def solve(rows: Tensor, drawn: Tensor) -> tuple[Tensor, Tensor, Tensor]:
             """Return frames, and in which rows some disobey their states and some overlap, all that could be done."""
-            of_states = conditioning_states(torch.cat([now[rows, None], states[rows]], dim=1), counts)
-            conditioning = self.flow.conditioning(observed[rows], times[rows], chain.places, of_states)
-
-            def predict(o: Tensor, tau: Tensor) -> Tensor:
-                nonlocal evaluations
-                evaluations += len(rows) / len(observed)
-                return torch.where(filled, self.flow(o, tau, conditioning), 0.0)
-
-            y = flow.SOLVERS[solver](predict, drawn, solver_steps)
-            numbers = self.from_innovations(y, observed[rows], times[rows], self.kinds(chain))
-            tokens = self._tokens(numbers, states[rows], chain)
+            nonlocal evaluations
+            given = observed[rows], now[rows], states[rows], times[rows]
+            tokens, n = self.solved(*given, chain, drawn, solver=solver, solver_steps=solver_steps)
+            evaluations += n * len(rows) / len(observed)
             resolved = mended(tokens.flatten(0, 1), states[rows].flatten(0, 1), chain)
             frames, astray, crowded = (x.unflatten(0, tokens.shape[:2]) for x in resolved)
             return self._laid(frames, chain), astray.any(-1), crowded.any(-1)

@@ -1,0 +1,208 @@
+"""Teach weights of peptides to keep their own equilibrium: `python docs/studies/training/peptide_equilibrium.py OUT`.
+
+`--weights W --steps N`, and no MD. The probabilities of torsion states know equilibrium twice: as states at endless
+times, and as those in which steps end up. Both are learned from the same runs, yet differ, the first by less from MD of
+molecules never seen. A copy is trained to keep these by steps of 1 ps to 1 ns: of frames drawn at endless times as many
+are to go from one state of a torsion to another as come back (detailed balance), and apart from that its probabilities
+are to stay what they were. Frames are those of `--molecules` of the wide campaign, of which the weights may know none;
+of the last of these, which play no part, the curves show how far it is from balance. It is the first solvent that is
+taught; signs of phi stay as they are. What is in OUT half done is gone on with.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+from collections.abc import Sequence
+from functools import cache
+from itertools import combinations
+from pathlib import Path
+from typing import NamedTuple, cast
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from peptide_list import wide_peptides
+from torch import Tensor
+
+from surrogate.models.architecture import weights_path
+from surrogate.models.peptides.chains import MOST_STATES, ChainFeatures, mended
+from surrogate.models.peptides.layout import chain_features
+from surrogate.models.peptides.model import PeptideSlide, times_apart
+from surrogate.models.peptides.subjects import balanced_starts
+from surrogate.models.weights import load_weights, provenance_of, save_weights
+from surrogate.training.loop import Stage, StageConfig, train_stages
+from systems.prepare.peptide import build_peptide
+
+# Frames of a molecule, and states of which these are chosen: half of them so that rare ones are among them.
+_FRAMES, _POOL, _FIRST = 800, 8192, 64
+# Windows of a step of training; the share at endless times, whose probabilities stay.
+_WINDOWS, _ENDLESS_SHARE, _ENDLESS_FRAMES = 256, 0.15, 4
+# What detailed balance counts beside what probabilities were, the square of a logarithm beside a divergence; states in
+# which fewer frames are say nothing, and how far, squared, sequences differ.
+_BALANCE, _LEAST_FRAMES, _DIFFER = 0.3, 3.0, 0.05
+_RATE, _HELD, _VALIDATE_S, _VALIDATED = 4e-4, 16, 120.0, ((10.0, 8), (100.0, 8), (1000.0, 1))
+
+
+class Equilibrium(NamedTuple):
+    """Frames of a molecule that weights draw at endless times: its `chain`, numbers `observed` (n, r, slots), `states`
+    (n, r, MOST_TORSIONS), and what each counts `weights` (n,): rare states are drawn more often than they occur."""
+
+    chain: ChainFeatures
+    observed: Tensor
+    states: Tensor
+    weights: Tensor
+
+    @classmethod
+    @torch.no_grad()
+    def of(cls, model: PeptideSlide, sequence: str, seed: int = 0) -> Equilibrium:
+        scene, generator = build_peptide(sequence), torch.Generator().manual_seed(seed)
+        chain = chain_features(scene, model.config)
+        built = torch.tensor(scene.positions_nm, dtype=torch.float32)[None]
+        found = cls(chain, *model.normalised(built, chain), torch.ones(1))
+        for n in (_FIRST, _FRAMES):
+            found = found.later(model, n, generator)
+        return found
+
+    def later(self, model: PeptideSlide, n: int, generator: torch.Generator) -> Equilibrium:
+        """Return `n` frames endless times after any of these, but for those that cannot be mended."""
+        chain, counts, stated = self.chain, self.chain.stated.counts, self.chain.stated
+        start = torch.randint(len(self.states), (_POOL,), generator=generator)
+        times = torch.full((_POOL, 1), model.config.forgotten_ps)
+        uniform = torch.rand(_POOL, 1, *counts.shape, generator=generator)
+        given = self.observed[start], self.states[start], chain.places, counts, times, times
+        states = model.jumps_of(chain).draw(*given, uniform)
+        sought = balanced_starts(states[:, 0, stated.residue, stated.slot]).max(dim=1).values
+        likely = 1.0 + sought / sought.mean()
+        chosen = torch.multinomial(likely, n, True, generator=generator)
+        noise = torch.randn(n, 1, *chain.code.filled.shape, generator=generator) * chain.code.filled
+        before = self.observed[start[chosen]], self.states[start[chosen]]
+        tokens, _ = model.solved(
+            *before, states[chosen], times[:n], chain, noise, solver=model.solvers[0], solver_steps=model.usual_steps
+        )
+        frames, astray, crowded = mended(tokens[:, 0], states[chosen, 0], chain)
+        kept = ~(astray | crowded)
+        return Equilibrium(chain, *model.normalised(frames[kept], chain), likely[chosen][kept].reciprocal().float())
+
+
+class Step(NamedTuple):
+    """Of windows, how far probabilities are from the teacher's (Kullback-Leibler divergence per frame and torsion),
+    and of every two states of a torsion the logarithm of how many more go one way than the other, `unbalanced` (k,),
+    and what it `counts` (k,), at most 1."""
+
+    divergence: Tensor
+    unbalanced: Tensor
+    counts: Tensor
+
+    @property
+    def loss(self) -> Tensor:
+        return (self.counts * self.unbalanced.square()).sum() / max(1, len(self.counts))
+
+
+def step(
+    model: PeptideSlide, teacher: PeptideSlide, frames: Equilibrium, rows: Tensor, times_ps: Tensor,
+    generator: torch.Generator,
+) -> Step:  # fmt: skip
+    """Draw states at `times_ps` (t,) after the frames `rows` (b,) by `model`, and compare probabilities."""
+    chain, counts, weights = frames.chain, frames.chain.stated.counts, frames.weights[rows]
+    observed, now, times = frames.observed[rows], frames.states[rows], times_ps.expand(len(rows), -1)
+    given = chain.places, counts, times, times_apart(times, model.config.forgotten_ps)
+    with torch.no_grad():
+        uniform = torch.rand(*times.shape, *counts.shape, generator=generator)
+        later = model.jumps_of(chain).draw(observed, now, *given, uniform)
+        states = torch.cat([now[:, None], later], dim=1)
+        taught = list(teacher.jumps_of(chain).of_windows(observed, states, *given))
+    divergence, unbalanced, counted = observed.new_zeros(()), [observed.new_zeros(0)], [observed.new_zeros(0)]
+    own = model.jumps_of(chain).of_windows(observed, states, *given)
+    for (torsion, has, logits), (*_, wanted) in zip(own, taught, strict=True):
+        # States that a torsion lacks are infinitely unlikely to both.
+        target, found = (x.log_softmax(-1).masked_fill(torch.isinf(wanted), 0.0) for x in (wanted, logits))
+        divergence = divergence + (wanted.softmax(-1) * (target - found)).sum()
+        moving = [k for k, r in enumerate(has.tolist()) if torsion or r not in chain.signed]
+        before = F.one_hot(states[:, :-1, has[moving], torsion], MOST_STATES).float()
+        flux = torch.einsum("btna,btnc,b->nac", before, logits[:, :, moving].softmax(-1), weights).clamp(min=1e-9).log()
+        # As many frames as the weights of those in a state are worth.
+        sums = [torch.einsum("bna,b->na", before[:, 0], w) for w in (weights, weights.square())]
+        worth = sums[0].square() / sums[1].clamp(min=1e-9)
+        for a, b in combinations(range(MOST_STATES), 2):
+            enough = torch.minimum(worth[:, a], worth[:, b]) >= _LEAST_FRAMES
+            unbalanced.append((flux[:, a, b] - flux[:, b, a])[enough])
+            counted.append(_DIFFER / (_DIFFER + (1.0 / worth[:, a] + 1.0 / worth[:, b])[enough]))
+    n = times.numel() * max(1, int((counts > 0).sum()))
+    return Step(divergence / n, torch.cat(unbalanced), torch.cat(counted))
+
+
+def some_times(model: PeptideSlide, generator: torch.Generator) -> Tensor:
+    """Return the times `(t,)` of a chunk's frames, evenly spaced by a lag drawn evenly in its logarithm, half of the
+    chunks whole; or endless ones."""
+    c = model.config
+    if torch.rand(1, generator=generator) < _ENDLESS_SHARE:
+        return torch.full((_ENDLESS_FRAMES,), c.forgotten_ps)
+    lag_ps = c.shortest_ps * (c.longest_ps / c.shortest_ps) ** float(torch.rand(1, generator=generator))
+    most = max(1, min(c.chunk_frames, int(c.longest_ps / lag_ps)))
+    whole = torch.rand(1, generator=generator) < 0.5
+    return lag_ps * torch.arange(1, 1 + (most if whole else int(torch.randint(1, 1 + most, (1,), generator=generator))))
+
+
+def teach(start: Path, out: Path, n_molecules: int, steps: int) -> Path:
+    """Write weights that keep the equilibrium of those of `start`. Raises SimulationError when training diverges."""
+    weights = load_weights(start)
+    teacher, model = (cast(PeptideSlide, w.model) for w in (weights, load_weights(start)))
+    model.requires_grad_(True)
+    sequences = [peptide.sequence for peptide in wide_peptides()]
+    trained, held = sequences[:n_molecules], sequences[max(n_molecules, len(sequences) - _HELD) :]
+
+    @cache
+    def frames_of(sequence: str) -> Equilibrium:
+        return Equilibrium.of(teacher, sequence)
+
+    def loss(generator: torch.Generator) -> tuple[Tensor, dict[str, Tensor]]:
+        frames = frames_of(trained[int(torch.randint(len(trained), (1,), generator=generator))])
+        rows = torch.randint(len(frames.states), (_WINDOWS,), generator=generator)
+        found = step(model, teacher, frames, rows, times := some_times(model, generator), generator)
+        endless = bool(times[0] >= model.config.forgotten_ps)
+        total = found.divergence if endless else found.divergence + _BALANCE * found.loss
+        return total, {"divergence": found.divergence.detach(), "unbalanced": found.loss.detach()}
+
+    @torch.no_grad()
+    def validate() -> dict[str, float]:
+        curves = {}
+        for lag_ps, n in _VALIDATED:
+            each = []
+            for sequence in held:
+                frames, generator = frames_of(sequence), torch.Generator().manual_seed(0)
+                times = lag_ps * torch.arange(1, 1 + n)
+                each.append(step(model, teacher, frames, torch.arange(len(frames.states)), times, generator))
+            squares, counts = (
+                torch.cat(x) for x in zip(*((e.counts * e.unbalanced.square(), e.counts) for e in each), strict=True)
+            )
+            curves[f"validation_unbalanced_{lag_ps:g}ps"] = math.sqrt(squares.sum() / counts.sum())
+            curves[f"validation_divergence_{lag_ps:g}ps"] = float(np.mean([float(e.divergence) for e in each]))
+        return curves
+
+    def write(spent_s: list[float]) -> None:
+        settings = {
+            "keeps_equilibrium": True,
+            "steps": steps,
+            "molecules": n_molecules,
+            "spent_s": round(sum(spent_s), 1),
+        }
+        save_weights(out, model, weights.domain, provenance_of({}, settings, weights), half=True)
+
+    stage = StageConfig("equilibrium", _WINDOWS, _RATE, None, steps, bf16=False, validate_every_s=_VALIDATE_S)
+    train_stages([Stage(model.jumps, stage, loss, validate)], out, write, device=torch.device("cpu"), resume=True)
+    return out
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("out", type=Path)
+    parser.add_argument("--weights", required=True)
+    parser.add_argument("--molecules", type=int, default=500)
+    parser.add_argument("--steps", type=int, default=3600)
+    a = parser.parse_args(arguments)
+    teach(weights_path(a.weights), a.out, a.molecules, a.steps)
+
+
+if __name__ == "__main__":
+    main()
