@@ -241,6 +241,10 @@ def test_md_of_tests_is_told_by_its_torsions(tmp_path: Path) -> None:
     for histograms in (peptide_unseen.densities, partial(peptide_unseen.joint_densities, pairs=[(0, 1)])):
         for one, other in zip(histograms(found.torsions, count), histograms(turned, count), strict=True):
             np.testing.assert_array_equal(one, other)
+    # What is written again stays what it is.
+    peptide_reference.write(tmp_path / "b.npz", [found])
+    (again,) = peptide_reference.references(tmp_path / "b.npz")
+    np.testing.assert_array_equal(again.torsions, found.torsions)
     with pytest.raises(InputError, match="no molecule"):
         list(peptide_reference.references(tmp_path))
 
@@ -383,7 +387,7 @@ def test_a_correction_weighs_frames_by_their_residues_maps(monkeypatch: pytest.M
 def test_weights_are_taught_to_keep_what_they_draw_at_endless_times(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """They begin with steps by which psi of alanine goes to its second state too often, and at endless times does not."""
+    """They begin with steps, and these alone, by which psi of alanine goes to its second state too often."""
     for name, value in {"_FRAMES": 300, "_POOL": 2048, "_HELD": 1, "_RATE": 2e-2}.items():
         monkeypatch.setattr(peptide_equilibrium, name, value)
     shipped = load_weights(weights_path("peptides"))
@@ -391,20 +395,38 @@ def test_weights_are_taught_to_keep_what_they_draw_at_endless_times(
     with torch.no_grad():
         begun.jumps.of_change[:, :, 1, 0, 1] += torch.tensor([2.0, -0.5])[:, None]
     save_weights(start := tmp_path / "start.safetensors", begun, shipped.domain, {}, half=True)
-    taught = cast(PeptideSlide, load_weights(teach(start, tmp_path / "taught.safetensors", 1, 40)).model)
+    taught = cast(PeptideSlide, load_weights(teach(start, tmp_path / "taught.safetensors", 1, 60)).model)
     frames = Equilibrium.of(begun, "ACE-ALA-NME", seed=1)
     rows = torch.arange(len(frames.states))
 
     def of_psi(model: PeptideSlide, time_ps: float) -> float:
         """How many more go to the second state than come back."""
         found = step(model, begun, frames, rows, torch.tensor([time_ps]), torch.Generator().manual_seed(0))
-        return float(found.unbalanced[0])
+        return float(found.unbalanced[:, 0].mean())
 
-    assert of_psi(begun, 10.0) > 0.8 and abs(of_psi(taught, 10.0)) < 0.3
-    endless = begun.config.forgotten_ps
-    assert abs(of_psi(begun, endless)) < 0.3 and abs(of_psi(taught, endless) - of_psi(begun, endless)) < 0.1
+    assert of_psi(begun, 10.0) > 0.8 and abs(of_psi(taught, 10.0)) < 0.5 * of_psi(begun, 10.0)
+    assert max(abs(of_psi(model, begun.config.forgotten_ps)) for model in (begun, taught)) < 0.2
     moved = {k.split(".")[0] for k, x in taught.state_dict().items() if not torch.equal(x, begun.state_dict()[k])}
     assert moved == {"jumps"}
+
+
+def test_a_solvent_may_take_over_what_other_weights_have(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """And the first keeps what it has."""
+    start, other = (load_weights(weights_path("peptides")) for _ in range(2))
+    before, taken = cast(PeptideSlide, start.model).jumps.of_change.clone(), cast(PeptideSlide, other.model).jumps
+    with torch.no_grad():
+        taken.of_change += 1.0
+
+    def as_the_first(model: PeptideSlide, _: Any) -> None:
+        model.jumps_elsewhere[0].load_state_dict(model.jumps.state_dict())
+
+    monkeypatch.setitem(peptide_transfer.LEVELS, "transfer", as_the_first)
+    peptide_transfer.with_levels([], start, {}, tmp_path / "w.safetensors", "transfer", other)
+    found = cast(PeptideSlide, load_weights(tmp_path / "w.safetensors").model)
+    assert torch.equal(found.jumps.of_change, before)
+    torch.testing.assert_close(found.jumps_elsewhere[0].of_change, before + 1.0, atol=1e-3, rtol=1e-3)
+    with pytest.raises(SystemExit):
+        peptide_transfer.main(["w.safetensors", "--start", "peptides", "--tuned", "pace", "--of", "peptides"])
 
 
 def test_populations_are_set_once_however_many_passes(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

@@ -3,10 +3,10 @@
 `--weights W --steps N`, and no MD. The probabilities of torsion states know equilibrium twice: as states at endless
 times, and as those in which steps end up. Both are learned from the same runs, yet differ, the first by less from MD of
 molecules never seen. A copy is trained to keep these by steps of 1 ps to 1 ns: of frames drawn at endless times as many
-are to go from one state of a torsion to another as come back (detailed balance), and apart from that its probabilities
-are to stay what they were. Frames are those of `--molecules` of the wide campaign, of which the weights may know none;
-of the last of these, which play no part, the curves show how far it is from balance. It is the first solvent that is
-taught; signs of phi stay as they are. What is in OUT half done is gone on with.
+are to go from one state of a torsion to another as come back (detailed balance), both together as many as before, and
+apart from that its probabilities are to stay what they were. Frames are those of `--molecules` of the wide campaign, of
+which the weights may know none; of the last of these, which play no part, the curves show how far it is from balance.
+It is the first solvent that is taught; signs of phi stay as they are. What is in OUT half done is gone on with.
 """
 
 from __future__ import annotations
@@ -86,17 +86,24 @@ class Equilibrium(NamedTuple):
 
 
 class Step(NamedTuple):
-    """Of windows, how far probabilities are from the teacher's (Kullback-Leibler divergence per frame and torsion),
-    and of every two states of a torsion the logarithm of how many more go one way than the other, `unbalanced` (k,),
-    and what it `counts` (k,), at most 1."""
+    """Of windows, how far probabilities are from the teacher's (Kullback-Leibler divergence per frame and torsion); and
+    of every two states of a torsion, by either half of the windows, the logarithms of how many more go one way than the
+    other, `unbalanced` (2, k), and of how many more go than by the teacher, `faster` (2, k), and what these count (k,),
+    at most 1."""
 
     divergence: Tensor
     unbalanced: Tensor
+    faster: Tensor
     counts: Tensor
+
+    def square(self, what: Tensor) -> Tensor:
+        """Return the mean square (k,) of what halves say, as it counts. Their product leaves their chance out, which a
+        training would else make less by probabilities that are alike in all frames, and higher."""
+        return self.counts * what.prod(dim=0)
 
     @property
     def loss(self) -> Tensor:
-        return (self.counts * self.unbalanced.square()).sum() / max(1, len(self.counts))
+        return (self.square(self.unbalanced) + self.square(self.faster)).sum() / max(1, len(self.counts))
 
 
 def step(
@@ -112,24 +119,31 @@ def step(
         later = model.jumps_of(chain).draw(observed, now, *given, uniform)
         states = torch.cat([now[:, None], later], dim=1)
         taught = list(teacher.jumps_of(chain).of_windows(observed, states, *given))
-    divergence, unbalanced, counted = observed.new_zeros(()), [observed.new_zeros(0)], [observed.new_zeros(0)]
+    divergence, found = observed.new_zeros(()), [observed.new_zeros(5, 0)]
     own = model.jumps_of(chain).of_windows(observed, states, *given)
     for (torsion, has, logits), (*_, wanted) in zip(own, taught, strict=True):
         # States that a torsion lacks are infinitely unlikely to both.
-        target, found = (x.log_softmax(-1).masked_fill(torch.isinf(wanted), 0.0) for x in (wanted, logits))
-        divergence = divergence + (wanted.softmax(-1) * (target - found)).sum()
+        target, ours = (x.log_softmax(-1).masked_fill(torch.isinf(wanted), 0.0) for x in (wanted, logits))
+        divergence = divergence + (wanted.softmax(-1) * (target - ours)).sum()
         moving = [k for k, r in enumerate(has.tolist()) if torsion or r not in chain.signed]
         before = F.one_hot(states[:, :-1, has[moving], torsion], MOST_STATES).float()
-        flux = torch.einsum("btna,btnc,b->nac", before, logits[:, :, moving].softmax(-1), weights).clamp(min=1e-9).log()
-        # As many frames as the weights of those in a state are worth.
-        sums = [torch.einsum("bna,b->na", before[:, 0], w) for w in (weights, weights.square())]
-        worth = sums[0].square() / sums[1].clamp(min=1e-9)
+        # Fluxes (2, n, from, to) of either half, and as many frames as the weights of those in a state are worth.
+        flux, known = (
+            torch.stack([torch.einsum("btna,btnc,b->nac", before[k::2], x[k::2], weights[k::2]) for k in (0, 1)])
+            .clamp(min=1e-9).log() for x in (logits[:, :, moving].softmax(-1), wanted[:, :, moving].softmax(-1))
+        )  # fmt: skip
+        worth = torch.stack([
+            torch.einsum("bna,b->na", before[k::2, 0], weights[k::2]).square()
+            / torch.einsum("bna,b->na", before[k::2, 0], weights[k::2].square()).clamp(min=1e-9) for k in (0, 1)
+        ])  # fmt: skip
         for a, b in combinations(range(MOST_STATES), 2):
-            enough = torch.minimum(worth[:, a], worth[:, b]) >= _LEAST_FRAMES
-            unbalanced.append((flux[:, a, b] - flux[:, b, a])[enough])
-            counted.append(_DIFFER / (_DIFFER + (1.0 / worth[:, a] + 1.0 / worth[:, b])[enough]))
-    n = times.numel() * max(1, int((counts > 0).sum()))
-    return Step(divergence / n, torch.cat(unbalanced), torch.cat(counted))
+            enough = torch.minimum(worth[..., a], worth[..., b]).amin(0) >= _LEAST_FRAMES
+            both = flux[..., a, b], flux[..., b, a]
+            faster = (sum(both) - known[..., a, b] - known[..., b, a]) / 2
+            counted = _DIFFER / (_DIFFER + 1.0 / worth[..., a].sum(0) + 1.0 / worth[..., b].sum(0))
+            found.append(torch.cat([both[0] - both[1], faster, counted[None]])[:, enough])
+    n, each = times.numel() * max(1, int((counts > 0).sum())), torch.cat(found, dim=1)
+    return Step(divergence / n, each[:2], each[2:4], each[4])
 
 
 def some_times(model: PeptideSlide, generator: torch.Generator) -> Tensor:
@@ -173,10 +187,10 @@ def teach(start: Path, out: Path, n_molecules: int, steps: int) -> Path:
                 frames, generator = frames_of(sequence), torch.Generator().manual_seed(0)
                 times = lag_ps * torch.arange(1, 1 + n)
                 each.append(step(model, teacher, frames, torch.arange(len(frames.states)), times, generator))
-            squares, counts = (
-                torch.cat(x) for x in zip(*((e.counts * e.unbalanced.square(), e.counts) for e in each), strict=True)
-            )
-            curves[f"validation_unbalanced_{lag_ps:g}ps"] = math.sqrt(squares.sum() / counts.sum())
+            counts = sum(float(e.counts.sum()) for e in each)
+            for name in ("unbalanced", "faster"):
+                square = sum(float(e.square(getattr(e, name)).sum()) for e in each) / counts
+                curves[f"validation_{name}_{lag_ps:g}ps"] = math.sqrt(max(0.0, square))
             curves[f"validation_divergence_{lag_ps:g}ps"] = float(np.mean([float(e.divergence) for e in each]))
         return curves
 

@@ -3,8 +3,8 @@
     python docs/studies/training/peptide_reference.py CAMPAIGN/test
 
 writes `unseen_torsions.npz`: of each molecule, the first 10 ns of each run, phi, psi and chi every 10 ps in steps of
-0.4 degrees, which parts all bins of `peptide_unseen` evenly, and the first frames. So rollouts can be compared with
-MD that took more than an hour of a core and is not kept.
+0.4 degrees, which parts all bins of `peptide_unseen` evenly, and the first frames. What it holds of other molecules
+stays. So rollouts can be compared with MD that took hours of a core and is not kept.
 """
 
 from __future__ import annotations
@@ -96,9 +96,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("test", type=Path)
     parser.add_argument("-o", "--out", type=Path, default=RECORD)
     a = parser.parse_args(arguments)
-    some = list(references(a.test))
-    write(a.out, some)
-    sys.stdout.write("".join(f"{one.name}: {len(one.torsions)} runs of {one.time_ps:g} ps\n" for one in some))
+    places = (*([a.out] if a.out.exists() else []), a.test)
+    some = {one.name: one for place in places for one in references(place)}
+    write(a.out, [some[name] for name in sorted(some)])
+    sys.stdout.write("".join(f"{one.name}: {len(one.torsions)} runs of {one.time_ps:g} ps\n" for one in some.values()))
 
 
 if __name__ == "__main__":

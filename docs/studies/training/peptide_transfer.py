@@ -4,15 +4,16 @@
                [--start WEIGHTS] [--tuned all|flow|states] [--coupled] [--runs 16] [--steps N] [--unseen 12] [--half]
     python docs/studies/training/peptide_transfer.py OUT.safetensors --train FOLDER [FOLDER ...] --start WEIGHTS
                --tuned pace
-    python docs/studies/training/peptide_transfer.py OUT.safetensors --start WEIGHTS --tuned transfer
+    python docs/studies/training/peptide_transfer.py OUT.safetensors --start WEIGHTS --tuned transfer [--of WEIGHTS]
 
 FOLDER: `train` in a folder of `peptide_campaign` or `peptide_runs`, of each molecule in it the first `--runs`. `flow`
 and `states` train the flow or the probabilities of torsion states alone, and need `--start`. `--unseen`: every so many
 molecules of several residues one is left out, and the curves show its loss. `--half` rounds to float16 at the end. Free
 energies of φ > 0 are those of `peptide_energies` beside OUT, or those that the weights gone on from were trained with.
 A training that was stopped goes on. These train nothing: `transfer` gives TIP3P the probabilities of OBC2, as often as
-its own have it (`balance.transfer`), in the mean over rollouts in it, which lie beside OUT; `pace` sets how often ψ
-changes its state beside other residues to what runs show (`balance.set_pace`). Populations: `peptide_populations`.
+its own have it (`balance.transfer`), in the mean over rollouts in it, which lie beside OUT, those of OBC2 as other
+weights have them where these are named by `--of`; `pace` sets how often ψ changes its state beside other residues to
+what runs show (`balance.set_pace`). Populations: `peptide_populations`.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Sequence
+from copy import deepcopy
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, cast
@@ -92,17 +94,24 @@ def rolled_in_water(start: Weights, folder: Path) -> Path:
 
 
 def with_levels(
-    sets: Sequence[TrainingFrames], start: Weights, energies: dict[str, float], out: Path, what: str
-) -> None:
-    """Write weights with the levels that frames show."""
+    sets: Sequence[TrainingFrames], start: Weights, energies: dict[str, float], out: Path, what: str,
+    of: Weights | None = None,
+) -> None:  # fmt: skip
+    """Write weights with the levels that frames show, beside the probabilities of OBC2 that others `of` have."""
     model = cast(PeptideSlide, start.model)
     chains = [chain_features(f.scene, model.config, f.conditions.get("solvent")) for f in sets]
     subjects = [PeptideSubject(f, chain).in_equilibrium(energies) for f, chain in zip(sets, chains, strict=True)]
+    kept = deepcopy(model.jumps.state_dict())
+    if of is not None:
+        model.jumps.load_state_dict(cast(PeptideSlide, of.model).jumps.state_dict())
     LEVELS[what](model, subjects)
+    if of is not None:
+        model.jumps.load_state_dict(kept)
     # Rollouts are nothing to learn from.
     learned = () if what == "transfer" else tuple(sets)
     domain = peptides_domain(learned, model.config, start.domain) if learned else start.domain
-    provenance = provenance_of(FrameSets(learned).origin, {"tuned": what}, start)
+    settings = {"tuned": what, **({} if of is None else {"of": of.hash})}
+    provenance = provenance_of(FrameSets(learned).origin, settings, start)
     save_weights(out, model, domain, provenance, half=True)
 
 
@@ -111,6 +120,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("out", type=Path)
     parser.add_argument("--train", type=Path, nargs="+")
     parser.add_argument("--start")
+    parser.add_argument("--of")
     parser.add_argument("--tuned", choices=(*TUNED, *LEVELS), default="all")
     parser.add_argument("--coupled", action="store_true")
     parser.add_argument("--runs", type=int, default=10_000)
@@ -121,6 +131,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     a = parser.parse_args(arguments)
     if a.tuned in LEVELS and a.start is None:
         parser.error(f"--tuned {a.tuned} goes on from weights: name them by --start.")
+    if a.of is not None and a.tuned != "transfer":
+        parser.error("--of is for --tuned transfer.")
     if a.tuned != "transfer" and not a.train:
         parser.error("name the folders of runs by --train.")
     if is_trained(a.out):
@@ -139,7 +151,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     sys.stdout.write(f"{len(sets)} sets of runs, {total_us:.3g} µs; left out: {', '.join(left) or 'none'}\n")
     energies = known_energies(a.out.parent) or trained_with(None if start is None else start.provenance)
     if a.tuned in LEVELS and start is not None:
-        with_levels(sets, start, energies, a.out, a.tuned)
+        with_levels(sets, start, energies, a.out, a.tuned, None if a.of is None else load_weights(weights_path(a.of)))
         return
     training = PeptideTraining(
         budget_s=a.budget, steps=a.steps, time_reversal=True, positive_phi_kt=energies, tuned=a.tuned,

@@ -74,8 +74,8 @@ LAGS_PS, BINS, JOINT_BINS, HALVES, SEED = (100.0, 1000.0), 50, 36, 10, 0
 ENDLESS = 200
 # By so many steps the pace of MD is measured; it is that of steps of 4 fs, as the runs have.
 PACE_STEPS, TIMESTEP_PS = {"obc2": 5000, "tip3p": 500}, 0.004
-# Columns of the first table; the others make a second one.
-DISTANCES = 7
+# The last column of the first table; the others make a second one.
+LAST_DISTANCE = "joint maps, pooled"
 
 
 def densities(runs: Runs, weights: Runs) -> list[FloatArray]:
@@ -424,12 +424,13 @@ def main(arguments: Sequence[str] | None = None) -> None:
                  *(["--solvent", a.solvent] if a.solvent else []),
                  *(["--library CAMPAIGN/train"] if a.library else [])]  # fmt: skip
         lines = [table_row(*each) for each in rows.items()]
-        columns = list(lines[0])
+        columns = [key for key in lines[0] if any(line[key] != "-" for line in lines)]
+        first = columns.index(LAST_DISTANCE) + 1
         about = {"command": " ".join(["python docs/studies/training/peptide_unseen.py FOLDER", *given]),
                  "machine": machine_name()}  # fmt: skip
         for out, shown_here, note in (
-            (a.out, columns[:DISTANCES], "; ".join(summary(rows)) + "."),
-            (a.out.with_stem(f"{a.out.stem}_states"), [columns[0], *columns[DISTANCES:]], ""),
+            (a.out, columns[:first], "; ".join(summary(rows)) + "."),
+            (a.out.with_stem(f"{a.out.stem}_states"), [columns[0], *columns[first:]], ""),
         ):
             table = {"columns": shown_here, "rows": [[line[key] for key in shown_here] for line in lines], **about}
             out.write_text(json.dumps(table | {"note": note}, indent=1, ensure_ascii=False) + "\n", "utf-8")
