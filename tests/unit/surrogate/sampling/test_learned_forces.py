@@ -181,7 +181,7 @@ def test_a_short_annealing_ends_as_cold_as_a_long_one(tmp_path: Path, monkeypatc
         return float(model.evaluate(x, molecule).energy_kj_mol.mean())
 
     # Of some 45 degrees of freedom, half a kT each: 56 kJ/mol above the minimum, 2 of error.
-    long, short = energy(20.0), energy(1.0)
+    long, short = energy(6.0), energy(1.0)
     assert abs(short - long) < 10.0
     monkeypatch.setattr(runner, "_COOLINGS", 0.0)
     assert energy(1.0) > long + 10.0, "negative control"
