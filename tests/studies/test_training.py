@@ -395,7 +395,7 @@ def test_weights_are_taught_to_keep_what_they_draw_at_endless_times(
     with torch.no_grad():
         begun.jumps.of_change[:, :, 1, 0, 1] += torch.tensor([2.0, -0.5])[:, None]
     save_weights(start := tmp_path / "start.safetensors", begun, shipped.domain, {}, half=True)
-    taught = cast(PeptideSlide, load_weights(teach(start, tmp_path / "taught.safetensors", 1, 60)).model)
+    taught = cast(PeptideSlide, load_weights(teach(start, tmp_path / "taught.safetensors", 1, 100)).model)
     frames = Equilibrium.of(begun, "ACE-ALA-NME", seed=1)
     rows = torch.arange(len(frames.states))
 
@@ -404,8 +404,9 @@ def test_weights_are_taught_to_keep_what_they_draw_at_endless_times(
         found = step(model, begun, frames, rows, torch.tensor([time_ps]), torch.Generator().manual_seed(0))
         return float(found.unbalanced[:, 0].mean())
 
-    assert of_psi(begun, 10.0) > 0.8 and abs(of_psi(taught, 10.0)) < 0.5 * of_psi(begun, 10.0)
-    assert max(abs(of_psi(model, begun.config.forgotten_ps)) for model in (begun, taught)) < 0.2
+    assert of_psi(begun, 10.0) > 0.8 and abs(of_psi(taught, 10.0)) < 0.3
+    endless = begun.config.forgotten_ps
+    assert abs(of_psi(begun, endless)) < 0.3 and abs(of_psi(taught, endless) - of_psi(begun, endless)) < 0.1
     moved = {k.split(".")[0] for k, x in taught.state_dict().items() if not torch.equal(x, begun.state_dict()[k])}
     assert moved == {"jumps"}
 

@@ -40,7 +40,7 @@ _FRAMES, _POOL, _FIRST = 800, 8192, 64
 _WINDOWS, _ENDLESS_SHARE, _ENDLESS_FRAMES = 256, 0.15, 4
 # What detailed balance counts beside what probabilities were, the square of a logarithm beside a divergence; states in
 # which fewer frames are say nothing, and how far, squared, sequences differ.
-_BALANCE, _LEAST_FRAMES, _DIFFER = 0.3, 3.0, 0.05
+_BALANCE, _LEAST_FRAMES, _DIFFER = 3.0, 3.0, 0.05
 _RATE, _HELD, _VALIDATE_S, _VALIDATED = 4e-4, 16, 120.0, ((10.0, 8), (100.0, 8), (1000.0, 1))
 
 
