@@ -339,12 +339,12 @@ def test_batches_of_populations_are_taken_together(tmp_path: Path) -> None:
 
 def test_pairs_under_an_umbrella_are_of_all_residues_and_no_test(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(peptide_campaign, "recorded", lambda: {("LEU-SER", 0), ("TRP-SER", 0), ("TRP-SER", 1)})
-    order = peptide_campaign.umbrella_order()
+    order = peptide_campaign.umbrella_order("tip3p")
     again = [(p.name, number) for _, p, number in order]
     assert ("VAL-ASN", 0) in again and not {("LEU-SER", 0), ("TRP-SER", 0), ("TRP-SER", 1)} & {*again}
     assert {("LEU-SER", 1), ("TRP-SER", 2)} <= {*again}
     monkeypatch.setattr(peptide_campaign, "recorded", set)
-    order = [(kind, p, number) for kind, p, number in peptide_campaign.umbrella_order() if number == 0]
+    order = [(kind, p, number) for kind, p, number in peptide_campaign.umbrella_order("tip3p") if number == 0]
     tests = [p.name for kind, p, _ in order if kind == "umbrella_test"]
     pairs = [p for kind, p, _ in order if kind == "umbrella"]
     assert tests == ["LEU-SER", "VAL-ASN"] and not set(tests) & {p.name for p in pairs}

@@ -2,7 +2,7 @@
 
     python docs/studies/training/peptide_campaign.py FOLDER --budget 3h [--workers 1] [--solvent obc2]
     python docs/studies/training/peptide_campaign.py FOLDER --list [--solvent obc2]
-    python docs/studies/training/peptide_campaign.py FOLDER --budget 3h --umbrella [--workers 1]
+    python docs/studies/training/peptide_campaign.py FOLDER --budget 3h --umbrella [--workers 1] [--solvent obc2]
 
 ff14SB, 300 K, 4 fs. Each batch is sixteen runs `FOLDER/{test,train,fine}/NAME/run_000.h5`, ... that begin in other
 states: sixteen replicas in OBC2, 100 ps at 500 K and 100 ps at 300 K. In water (NVT at the volume of 1 bar, PME, frames
@@ -13,9 +13,11 @@ tests are made of, these tests, the other monomers, two pairs with free ends and
 the rest of pairs with every residue once at either place, further tests, pairs and chains, then more runs of all. What
 is there is left alone and what was stopped goes on.
 
-`--umbrella`: capped pairs in water under an umbrella potential of psi and side chains, which MD in OBC2 of 1.2 ns a
-replica tells, from its frames with phi < 0: `FOLDER/umbrella/NAME`, those of tests in `umbrella_test`. They are
-for populations of torsion states, not for rates; what `peptide_populations` holds already is left out.
+`--umbrella`: under an umbrella potential of psi and side chains, which MD in OBC2 of 1.2 ns a replica tells (in OBC2 of
+0.5 ns), from its frames with phi < 0: `FOLDER/umbrella/NAME`. They are for populations of torsion states, not for
+rates. In water these are capped pairs, those of tests in `umbrella_test`, but for what `peptide_populations` holds; in
+OBC2 what the wide campaign comes to last, which weights trained on its first molecules never saw, but for what
+`peptide_states` holds.
 """
 
 from __future__ import annotations
@@ -29,6 +31,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import peptide_states
 from peptide_list import (
     FIRST_TESTS,
     RESIDUES,
@@ -72,8 +75,10 @@ HOT_K, HOT_PS, COOL_PS = 500.0, 100.0, 100.0
 TURNED_PS, STIFFNESS_KJ_MOL = 20.0, 300.0
 # For an umbrella potential: the MD in OBC2 that tells it, its first part left out where starts are drawn, and the runs
 # in water.
-RESOLVED_PS, RESOLVED_EVERY_PS, RELAXED = 1200.0, 0.4, 0.2
+RESOLVED_PS, RESOLVED_EVERY_PS, RELAXED = {"tip3p": 1200.0, "obc2": 500.0}, 0.4, 0.2
 UMBRELLA_PS, UMBRELLA_TEST_PS = 200.0, 500.0
+# In OBC2: of what the wide campaign has after so many molecules, pairs first.
+WIDE_FIRST, UMBRELLA_WIDE_PS, UMBRELLA_SAVED_PS = 184, 800.0, 2.0
 
 
 def dynamics(system: Any, temperature_k: float, seed: int, **how: Any) -> SimdReplicas:
@@ -103,16 +108,16 @@ def many_states(dry: Scene, seed: int) -> FloatArray:
     return cool.positions_nm
 
 
-def umbrella_of(dry: Scene, seed: int) -> tuple[Umbrella, FloatArray]:
-    """Return the umbrella potential of psi and side chains that MD in OBC2 tells, and positions `(n_replicas, n_atoms,
-    3)` with every phi negative."""
+def umbrella_of(dry: Scene, seed: int, resolved_ps: float) -> tuple[Umbrella, FloatArray]:
+    """Return the umbrella potential of psi and side chains that MD in OBC2 of `resolved_ps` tells, and positions
+    `(n_replicas, n_atoms, 3)` with every phi negative."""
     system, phis = build_system(dry, IMPLICIT), backbone_torsions(dry)["phi"]
     run = dynamics(system, 300.0, seed + 2, friction_per_ps=1.0, timestep_ps=0.004)
     run.set_positions(many_states(dry, seed))
     run.thermalise()
     quads, left_kt = umbrella_torsions(dry)
     angles, starts = [], []
-    for k in range(n := round(RESOLVED_PS / RESOLVED_EVERY_PS)):
+    for k in range(n := round(resolved_ps / RESOLVED_EVERY_PS)):
         run.step(round(RESOLVED_EVERY_PS / run.timestep_ps))
         x = run.positions_nm
         angles.append(torsion(x, quads))
@@ -152,7 +157,7 @@ def batch(
         in_water = solvent == WATER.solvent
         scene = solvate(dry, WATER, WaterBox()) if in_water else dry
         seed = zlib.crc32(f"{'water' if in_water else solvent}:{peptide.name}:{number}".encode()) % (2**31 - 2)
-        umbrella, starts = umbrella_of(dry, seed) if with_umbrella else (None, None)
+        umbrella, starts = umbrella_of(dry, seed, RESOLVED_PS[solvent]) if with_umbrella else (None, None)
         if any(part.exists() for part in parts_of(folder, numbers)):
             starts = None
         else:
@@ -198,9 +203,14 @@ def order(solvent: str) -> list[tuple[str, Peptide, int]]:
     ]
 
 
-def umbrella_order() -> list[tuple[str, Peptide, int]]:
-    """Return the same of batches under an umbrella potential: the tests that are pairs, then pairs with every residue
-    once at either place, those of the tests' residues first, then the rest; and again."""
+def umbrella_order(solvent: str) -> list[tuple[str, Peptide, int]]:
+    """Return the same of batches under an umbrella potential: in OBC2 the last of the wide campaign; in water the tests
+    that are pairs, then pairs with every residue once at either place, those of the tests' residues first, then the
+    rest; and again."""
+    if solvent == IMPLICIT.solvent:
+        last = sorted(wide_peptides()[WIDE_FIRST:], key=lambda p: len(p.residues) > 2)
+        states = {md.name for md in peptide_states.read()}
+        return [("umbrella", replace(p, time_ps=UMBRELLA_WIDE_PS), 0) for p in last if p.name not in states]
     tests = [replace(p, time_ps=UMBRELLA_TEST_PS) for p in TEST if p.capped]
     named = {residue for p in tests for residue in p.residues}
     pairs = [p for kind, p, number in order(WATER.solvent) if (kind, number) == ("train", 0) and p.capped]
@@ -214,22 +224,22 @@ def umbrella_order() -> list[tuple[str, Peptide, int]]:
 
 def make(task: tuple[str, Peptide, int], deadline: float, folder: str, solvent: str) -> None:
     kind, peptide, number = task
-    every_ps = FINE_SAVED_PS if kind == "fine" else SAVED_PS[solvent]
     with_umbrella = kind.startswith("umbrella")
+    every_ps = FINE_SAVED_PS if kind == "fine" else SAVED_PS[solvent]
+    if with_umbrella and solvent == IMPLICIT.solvent:
+        every_ps = UMBRELLA_SAVED_PS
     batch(Path(folder) / kind / peptide.name, peptide, number, solvent, every_ps, with_umbrella=with_umbrella)
 
 
 SWITCHES = {
     "--list": "print what is there and simulate nothing",
-    "--umbrella": "pairs in water under an umbrella potential",
+    "--umbrella": "MD under an umbrella potential",
 }
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
     chosen = arguments_of(__doc__, SWITCHES, arguments, solvents=SAVED_PS)
-    if chosen.umbrella and chosen.solvent != WATER.solvent:
-        raise SystemExit("--umbrella is for water; leave --solvent out.")
-    tasks = umbrella_order if chosen.umbrella else partial(order, chosen.solvent)
+    tasks = partial(umbrella_order if chosen.umbrella else order, chosen.solvent)
     if chosen.list:
         for kind, peptide, number in tasks():
             done = len(list((chosen.folder / kind / peptide.name).glob("run_*.h5"))) - number * n_replicas()

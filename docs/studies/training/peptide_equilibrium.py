@@ -146,12 +146,10 @@ def step(
     return Step(divergence / n, each[:2], each[2:4], each[4])
 
 
-def some_times(model: PeptideSlide, generator: torch.Generator) -> Tensor:
+def some_lags(model: PeptideSlide, generator: torch.Generator) -> Tensor:
     """Return the times `(t,)` of a chunk's frames, evenly spaced by a lag drawn evenly in its logarithm, half of the
-    chunks whole; or endless ones."""
+    chunks whole."""
     c = model.config
-    if torch.rand(1, generator=generator) < _ENDLESS_SHARE:
-        return torch.full((_ENDLESS_FRAMES,), c.forgotten_ps)
     lag_ps = c.shortest_ps * (c.longest_ps / c.shortest_ps) ** float(torch.rand(1, generator=generator))
     most = max(1, min(c.chunk_frames, int(c.longest_ps / lag_ps)))
     whole = torch.rand(1, generator=generator) < 0.5
@@ -173,8 +171,10 @@ def teach(start: Path, out: Path, n_molecules: int, steps: int) -> Path:
     def loss(generator: torch.Generator) -> tuple[Tensor, dict[str, Tensor]]:
         frames = frames_of(trained[int(torch.randint(len(trained), (1,), generator=generator))])
         rows = torch.randint(len(frames.states), (_WINDOWS,), generator=generator)
-        found = step(model, teacher, frames, rows, times := some_times(model, generator), generator)
-        endless = bool(times[0] >= model.config.forgotten_ps)
+        endless = bool(torch.rand(1, generator=generator) < _ENDLESS_SHARE)
+        forgotten = torch.full((_ENDLESS_FRAMES,), model.config.forgotten_ps)
+        times = forgotten if endless else some_lags(model, generator)
+        found = step(model, teacher, frames, rows, times, generator)
         total = found.divergence if endless else found.divergence + _BALANCE * found.loss
         return total, {"divergence": found.divergence.detach(), "unbalanced": found.loss.detach()}
 

@@ -1,0 +1,250 @@
+"""States of peptides' torsions in OBC2, of MD under an umbrella potential: kept as a record, learned, and compared.
+
+    python docs/studies/training/peptide_states.py record CAMPAIGN
+    python docs/studies/training/peptide_states.py teach OUT.safetensors --weights WEIGHTS [--steps 3000]
+    python docs/studies/training/peptide_states.py compare [--weights WEIGHTS]
+
+CAMPAIGN is a folder of `peptide_campaign --umbrella --solvent obc2`. `record` adds its molecules to
+`umbrella_states.npz`: of each half of the runs, what states all torsions are in at once, drawn as often as frames count
+at equilibrium. Nothing else is kept of this MD, and the campaign leaves out what the record holds. `teach` trains the
+probabilities at endless times on it, but those of the signs of phi; by steps, and of molecules that WEIGHTS were
+trained on, they are to stay what they were. One molecule in eight is left out. `compare` says how far populations at
+endless times are from those of MD, of molecules learned and left out. Steps are taught by `peptide_equilibrium`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import random
+import sys
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+from typing import Any, NamedTuple, cast
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from peptide_equilibrium import Equilibrium, some_lags, step
+from peptide_list import held_out_peptides, training_peptides, unseen_peptides, wide_peptides
+from torch import Tensor
+
+from surrogate.comparison.read.ensemble import load_ensemble
+from surrogate.models.architecture import weights_path
+from surrogate.models.peptides.chains import MOST_STATES, MOST_TORSIONS, ChainFeatures
+from surrogate.models.peptides.layout import chain_features
+from surrogate.models.peptides.model import PeptideSlide
+from surrogate.models.peptides.trainer import state_loss
+from surrogate.models.weights import TrainingDomain, Weights, load_weights, provenance_of, save_weights
+from surrogate.training.loop import Stage, StageConfig, train_stages
+from systems.errors import InputError
+from systems.trajectory.codec import frame_factors
+
+RECORD = Path(__file__).with_name("umbrella_states.npz")
+# Of each half of the runs of a molecule.
+DRAWS = 2048
+LEFT_OUT = 8
+_WINDOWS, _TIMES, _RATE, _DROPPED, _VALIDATE_S = 256, 4, 1e-3, 0.2, 60.0
+# The shares of steps that learn from the record, and that keep endless times of so many molecules learned before; the
+# others keep steps of 1 ps to 1 ns of all these, whose probabilities count so many times more.
+_LEARNING, _KEEPING, _KNOWN, _STAYING = 0.35, 0.15, 120, 10.0
+
+
+class Md(NamedTuple):
+    """A molecule of the record: what is given to `build_peptide`, and `states` (2, DRAWS, n_torsions) by either half of
+    its runs, of torsions as `ChainFeatures.stated` has them."""
+
+    name: str
+    states: npt.NDArray[np.uint8]
+
+    @property
+    def sequence(self) -> str:
+        return self.name.removeprefix("free-") if self.name.startswith("free-") else f"ACE-{self.name}-NME"
+
+    def laid(self, chain: ChainFeatures) -> Tensor:
+        """Return the states `(n, n_residues, MOST_TORSIONS)`."""
+        flat = torch.from_numpy(self.states).flatten(0, 1).long()
+        found = flat.new_zeros(len(flat), len(chain.places), MOST_TORSIONS)
+        found[:, chain.stated.residue, chain.stated.slot] = flat
+        return found
+
+
+def drawn(states: npt.NDArray[np.uint8], factors: npt.NDArray[np.float64]) -> npt.NDArray[np.uint8]:
+    """Return DRAWS rows of `states` (n, k), in order, each as often as its `factors` (n,) say and nearly so."""
+    order = np.lexsort(states.T[::-1])
+    ends = np.cumsum(factors[order])
+    places = (np.arange(DRAWS) + 0.5) / DRAWS * ends[-1]
+    return states[order][np.searchsorted(ends, places)]
+
+
+def read(record: Path = RECORD) -> list[Md]:
+    """Return the molecules of a record. Raises InputError for one that is tested by."""
+    if not record.exists():
+        return []
+    with np.load(record) as kept:
+        found = [Md(name, kept[name]) for name in kept.files]
+    tested = {"-".join(p.residues) for p in (*unseen_peptides(), *held_out_peptides()) if len(p.residues) > 1}
+    if some := [md.name for md in found if md.name.removeprefix("free-") in tested]:
+        raise InputError(f"{record}: weights are tested on {', '.join(some)}; leave them out of the record.")
+    return found
+
+
+def gather(campaign: Path, model: PeptideSlide, record: Path = RECORD) -> None:
+    """Add the molecules of a campaign to a record."""
+    kept = {md.name: md.states for md in read(record)}
+    for place in sorted((campaign / "umbrella").glob("*")):
+        files = sorted(place.glob("run_*.h5"))
+        if place.name in kept or not files:
+            continue
+        md = load_ensemble(files)
+        assert md.differences_kj_mol is not None
+        chain = chain_features(md.scene, model.config)
+        at = chain.stated.residue, chain.stated.slot
+        states = [chain.states(torch.from_numpy(x))[:, at[0], at[1]].numpy().astype(np.uint8) for x in md.segments]
+        factors = frame_factors(md.differences_kj_mol, 300.0)
+        halves = [drawn(np.concatenate(states[k::2]), np.concatenate(factors[k::2])) for k in (0, 1)]
+        kept[place.name] = np.stack(halves)
+        every = np.concatenate(factors)
+        counted = every.sum() ** 2 / (every**2).sum()
+        sys.stdout.write(f"{place.name}: {len(every)} frames, of which {counted:.0f} count\n")
+    by_name: dict[str, Any] = {name: kept[name] for name in sorted(kept)}
+    np.savez_compressed(record, **by_name)
+
+
+def shares(states: Tensor, chain: ChainFeatures) -> Tensor:
+    """Return how often each torsion but phi is in each state `(n_torsions, MOST_STATES)`, of `states` (n, n_residues,
+    MOST_TORSIONS) with every phi negative."""
+    kept = states[(states[..., 0] == 0).all(dim=1)]
+    side = chain.stated.slot > 0
+    own = kept[:, chain.stated.residue[side], chain.stated.slot[side]]
+    return torch.nn.functional.one_hot(own, MOST_STATES).double().mean(dim=0)
+
+
+@torch.no_grad()
+def errors(model: PeptideSlide, some: Iterable[tuple[Md, Equilibrium]]) -> dict[str, float]:
+    """Return how far shares of states at endless times are from MD's, root mean square less MD's own error, and that
+    error, %."""
+    off, own, n = 0.0, 0.0, 0
+    for md, frames in some:
+        chain, generator = frames.chain, torch.Generator().manual_seed(0)
+        rows = torch.multinomial(frames.weights, 2 * DRAWS, True, generator=generator)
+        times = torch.full((2 * DRAWS, 1), model.config.forgotten_ps)
+        uniform = torch.rand(len(rows), 1, *chain.stated.counts.shape, generator=generator)
+        given = frames.observed[rows], frames.states[rows], chain.places, chain.stated.counts, times, times
+        ours = shares(model.jumps_of(chain).draw(*given, uniform)[:, 0], chain)
+        first, second = (shares(x, chain) for x in md.laid(chain).split(DRAWS))
+        off += float((ours - (first + second) / 2).square().sum())
+        own += float((first - second).square().sum()) / 4
+        n += int(chain.stated.counts[chain.stated.counts > 0].sum()) - 2 * int((chain.stated.slot == 0).sum())
+    return {"off": 100.0 * math.sqrt(max(0.0, off - own) / n), "own": 100.0 * math.sqrt(own / n)}
+
+
+def parted(some: Sequence[Md]) -> tuple[list[Md], list[Md]]:
+    """Return those that are learned, and those left out: by their places in the wide campaign, so that they stay what
+    they are as the record grows, and only where no earlier training saw their residues."""
+    first = {p.residues for p in training_peptides()}
+    out = {p.name for k, p in enumerate(wide_peptides()) if k % LEFT_OUT == 0 and p.residues not in first}
+    return [md for md in some if md.name not in out], [md for md in some if md.name in out]
+
+
+def with_sequences(domain: TrainingDomain, some: Sequence[Md]) -> TrainingDomain:
+    """Return the domain with further molecules trained on in OBC2."""
+    known = {*domain.sequences}
+    return replace(domain, sequences=(*domain.sequences, *(md.sequence for md in some if md.sequence not in known)))
+
+
+def teach(out: Path, start: Weights, steps: int, some: Sequence[Md]) -> Path:
+    """Write weights that draw the record's states at endless times. Raises SimulationError when training diverges."""
+    learned, left_out = parted(some)
+    teacher, model = (cast(PeptideSlide, w.model) for w in (start, load_weights(start.path)))
+    model.requires_grad_(True)
+    new = {md.sequence for md in some}
+    known = [sequence for sequence in start.domain.sequences if sequence not in new]
+    known = random.Random(0).sample(known, min(_KNOWN, len(known)))
+    steps_of = [*known, *(md.sequence for md in learned)]
+
+    @cache
+    def frames_of(sequence: str) -> Equilibrium:
+        return Equilibrium.of(teacher, sequence)
+
+    def pick(n: int, generator: torch.Generator, k: int = 1) -> Tensor:
+        return torch.randint(n, (k,), generator=generator)
+
+    def of_record(md: Md, generator: torch.Generator, dropped: float) -> Tensor:
+        frames = frames_of(md.sequence)
+        rows = pick(len(frames.states), generator, _WINDOWS)
+        laid = md.laid(frames.chain)
+        later = laid[pick(len(laid), generator, _WINDOWS * _TIMES)].unflatten(0, (_WINDOWS, _TIMES))
+        states = torch.cat([frames.states[rows][:, None], later], dim=1)
+        share = torch.ones(_WINDOWS, len(frames.chain.places), MOST_TORSIONS)
+        share[:, frames.chain.signed, 0] = 0.0
+        times = torch.full((_WINDOWS, _TIMES), model.config.forgotten_ps)
+        given = frames.chain, frames.observed[rows], states, times, generator
+        return state_loss(model, *given, share=share, dropped=dropped)
+
+    def loss(generator: torch.Generator) -> tuple[Tensor, dict[str, Tensor]]:
+        what = float(torch.rand(1, generator=generator))
+        if what < _LEARNING:
+            found = of_record(learned[int(pick(len(learned), generator))], generator, _DROPPED)
+            return found, {"states": found.detach()}
+        endless = what < _LEARNING + _KEEPING
+        times = torch.full((_TIMES,), model.config.forgotten_ps) if endless else some_lags(model, generator)
+        sequences = known if endless else steps_of
+        frames = frames_of(sequences[int(pick(len(sequences), generator))])
+        rows = pick(len(frames.states), generator, _WINDOWS)
+        found = step(model, teacher, frames, rows, times, generator).divergence
+        return (1.0 if endless else _STAYING) * found, {"divergence": found.detach()}
+
+    @torch.no_grad()
+    def validate() -> dict[str, float]:
+        curves: dict[str, float] = {}
+        for name, part in (("learned", learned[: len(left_out)]), ("left_out", left_out)):
+            found = errors(model, ((md, frames_of(md.sequence)) for md in part))
+            curves |= {f"validation_{name}_{what}": value for what, value in found.items()}
+            each = [float(of_record(md, torch.Generator().manual_seed(0), 0.0)) for md in part]
+            curves[f"validation_{name}_states"] = float(np.mean(each))
+        for lag_ps in (10.0, 100.0):
+            times, steps = lag_ps * torch.arange(1, 5), []
+            for frames in (frames_of(md.sequence) for md in left_out):
+                rows, generator = torch.arange(len(frames.states)), torch.Generator().manual_seed(0)
+                steps.append(step(model, teacher, frames, rows, times, generator))
+            counted = sum(float(each.counts.sum()) for each in steps)
+            faster = sum(float((each.counts * each.faster.mean(0)).sum()) for each in steps) / counted
+            divergence = float(np.mean([float(each.divergence) for each in steps]))
+            curves |= {f"validation_divergence_{lag_ps:g}ps": divergence, f"validation_faster_{lag_ps:g}ps": faster}
+        return curves
+
+    def write(spent_s: list[float]) -> None:
+        settings = {"umbrella_states": len(learned), "steps": steps, "spent_s": round(sum(spent_s), 1)}
+        save_weights(out, model, with_sequences(start.domain, learned), provenance_of({}, settings, start), half=True)
+
+    stage = StageConfig("states", _WINDOWS, _RATE, None, steps, bf16=False, validate_every_s=_VALIDATE_S)
+    train_stages([Stage(model.jumps, stage, loss, validate)], out, write, device=torch.device("cpu"), resume=True)
+    return out
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("what", choices=("record", "teach", "compare"))
+    parser.add_argument("path", type=Path, nargs="?")
+    parser.add_argument("--weights", default="peptides")
+    parser.add_argument("--steps", type=int, default=3000)
+    a = parser.parse_args(arguments)
+    if a.path is None and a.what != "compare":
+        parser.error(f"{a.what} needs a path.")
+    start = load_weights(weights_path(a.weights))
+    model = cast(PeptideSlide, start.model)
+    if a.what == "record":
+        gather(a.path, model)
+    elif a.what == "teach":
+        teach(a.path, start, a.steps, read())
+    else:
+        for name, part in zip(("learned", "left out"), parted(read()), strict=True):
+            found = errors(model, ((md, Equilibrium.of(model, md.sequence)) for md in part))
+            sys.stdout.write(f"{len(part)} {name}: off by {found['off']:.1f} %, MD's error {found['own']:.1f} %\n")
+
+
+if __name__ == "__main__":
+    main()

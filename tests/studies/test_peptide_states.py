@@ -1,0 +1,104 @@
+"""States of torsions of MD under an umbrella potential: which molecules, how frames count, and what weights learn."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import cast
+
+import numpy as np
+import peptide_campaign
+import peptide_equilibrium
+import peptide_states
+import pytest
+import torch
+from peptide_equilibrium import Equilibrium, step
+from peptide_list import held_out_peptides, training_peptides, unseen_peptides, wide_peptides
+from peptide_states import DRAWS, Md, drawn, errors, gather, parted, read, shares, teach
+
+from surrogate.models.architecture import weights_path
+from surrogate.models.peptides.layout import chain_features
+from surrogate.models.peptides.model import PeptideSlide
+from surrogate.models.weights import load_weights
+from systems.errors import InputError
+from systems.prepare.peptide import build_peptide
+
+
+def test_an_umbrella_is_of_molecules_that_no_run_of_the_first_ones_shows(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(peptide_states, "read", lambda: [Md("TRP-HIE", np.zeros((2, DRAWS, 7), np.uint8))])
+    order = [p for kind, p, number in peptide_campaign.umbrella_order("obc2") if (kind, number) == ("umbrella", 0)]
+    names = {p.name for p in order}
+    assert "PRO-CYS" in names and "TRP-HIE" not in names and len(names) == len(wide_peptides()) - 184 - 1
+    assert not names & {p.name for p in wide_peptides()[:184]}
+    assert not {p.residues for p in order} & {p.residues for p in (*unseen_peptides(), *held_out_peptides())}
+    long = [len(p.residues) > 2 for p in order]
+    assert long == sorted(long) and {p.time_ps for p in order} == {800.0}
+    learned, left_out = ({md.name for md in part} for part in parted([Md(name, np.zeros(0)) for name in names]))
+    assert len(order) / 10 < len(left_out) < len(order) / 7 and learned | left_out == names and not learned & left_out
+    assert not {tuple(name.removeprefix("free-").split("-")) for name in left_out} & {
+        p.residues for p in training_peptides()
+    }
+
+
+def test_states_are_drawn_as_often_as_they_count_and_tests_are_refused(tmp_path: Path) -> None:
+    states = np.array([[2, 0], [0, 1], [1, 1], [0, 1]], dtype=np.uint8)
+    found = drawn(states, np.array([3.0, 1.0, 0.0, 4.0]))
+    rows, counts = np.unique(found, axis=0, return_counts=True)
+    assert rows.tolist() == [[0, 1], [2, 0]] and counts.tolist() == [DRAWS * 5 // 8, DRAWS * 3 // 8]
+    np.savez(record := tmp_path / "record.npz", **{"GLN-ILE": np.zeros((2, DRAWS, 7), np.uint8)})
+    with pytest.raises(InputError, match=r"tested on GLN-ILE; leave them out"):
+        read(record)
+    assert read(tmp_path / "none.npz") == []
+
+
+def test_halves_of_runs_are_kept_apart(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """All runs have the same frames; helices count in the second of three, strands in the others."""
+    scene, model = build_peptide("ACE-CYS-NME"), cast(PeptideSlide, load_weights(weights_path("peptides")).model)
+    chain, frames = chain_features(scene, model.config), Equilibrium.of(model, "ACE-CYS-NME")
+    x = chain.code.decode(model._tokens(frames.observed, frames.states, chain)).numpy()
+    helix = chain.states(torch.from_numpy(x))[:, 1, 1].numpy() == 1
+    both = np.concatenate([np.flatnonzero(helix)[:40], np.flatnonzero(~helix)[:40]])
+    energies = np.repeat([-20.0, 20.0], 40)
+    md = SimpleNamespace(scene=scene, segments=[x[both]] * 3, differences_kj_mol=[energies, -energies, energies])
+    monkeypatch.setattr(peptide_states, "load_ensemble", lambda _: md)
+    (place := tmp_path / "umbrella" / "CYS").mkdir(parents=True)
+    (place / "run_000.h5").touch()
+    gather(tmp_path, model, record := tmp_path / "record.npz")
+    (found,) = read(record)
+    helices = [float((half[:, 1, 1] == 1).float().mean()) for half in found.laid(chain).split(DRAWS)]
+    assert sorted(helices) == pytest.approx([0.0, 1.0], abs=0.01)
+
+
+def test_weights_learn_states_at_endless_times_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for name, value in {"_FRAMES": 300, "_POOL": 2048}.items():
+        monkeypatch.setattr(peptide_equilibrium, name, value)
+    monkeypatch.setattr(peptide_states, "_RATE", 5e-3)
+    some = wide_peptides()[:2]
+    monkeypatch.setattr(peptide_states, "wide_peptides", lambda: some)
+    monkeypatch.setattr(peptide_states, "LEFT_OUT", 1000)
+    monkeypatch.setattr(peptide_states, "parted", lambda some: (list(some), list(some)))
+    start = load_weights(weights_path("peptides"))
+    start = replace(start, domain=replace(start.domain, sequences=("ACE-GLY-NME",)))
+    begun = cast(PeptideSlide, start.model)
+    frames = Equilibrium.of(begun, some[0].sequence, seed=1)
+    assert some[0].name == "ALA"
+    chain, rng = frames.chain, np.random.default_rng(0)
+    wanted = np.zeros((2, DRAWS, len(chain.stated.slot)), np.uint8)
+    for k, slot in enumerate(chain.stated.slot.tolist()):
+        if slot == 1:  # psi is in helices nine times of ten
+            wanted[..., k] = rng.random((2, DRAWS)) < 0.9
+        elif slot > 1:
+            wanted[..., k] = rng.integers(0, 3, (2, DRAWS))
+    md = Md("ALA", wanted)
+    taught = load_weights(teach(tmp_path / "taught.safetensors", start, 120, [md]))
+    model = cast(PeptideSlide, taught.model)
+    before, after = (errors(m, [(md, frames)])["off"] for m in (begun, model))
+    assert before > 20.0 and after < 8.0
+    rows, generator = torch.arange(len(frames.states)), torch.Generator().manual_seed(0)
+    for lag_ps in (10.0, 100.0):
+        found = step(model, begun, frames, rows, torch.tensor([lag_ps]), generator)
+        assert found.faster.abs().max() < 0.3 and found.divergence < 2e-3
+    both = [m.state_dict() for m in (begun, model)]
+    assert {k.split(".")[0] for k in both[0] if not torch.equal(both[0][k], both[1][k])} == {"jumps"}
+    assert shares(md.laid(chain), chain)[0, 1] == pytest.approx(0.9, abs=0.02)
