@@ -1,11 +1,12 @@
 """Teach weights of peptides to keep their own equilibrium: `python docs/studies/training/peptide_equilibrium.py OUT`.
 
-`--weights W --steps N`, and no MD. The probabilities of torsion states know equilibrium twice: as states at endless
-times, and as those in which steps end up. Both are learned from the same runs, yet differ, the first by less from MD of
-molecules never seen. A copy is trained to keep these by steps of 1 ps to 1 ns: of frames drawn at endless times as many
-are to go from one state of a torsion to another as come back (detailed balance), both together as many as before, and
-apart from that its probabilities are to stay what they were. Frames are those of `--molecules` of the wide campaign, of
-which the weights may know none; of the last of these, which play no part, the curves show how far it is from balance.
+`--weights W [--equilibrium E]`, and no MD. The probabilities of torsion states know equilibrium twice: as states at
+endless times, and as those in which steps end up. Both are learned from the same runs, yet differ, the first by less
+from MD of molecules never seen; those of E, by `peptide_states`, by less still. A copy is trained to keep these by
+steps of 1 ps to 1 ns: of frames drawn at endless times as many are to go from one state of a torsion to another as come
+back (detailed balance), both together as many as before, and apart from that its probabilities are to stay what they
+were. Frames are those of `--molecules` of the wide campaign, of which the weights may know none; of the last of these,
+which play no part, the curves show how far it is from balance.
 It is the first solvent that is taught; signs of phi stay as they are. What is in OUT half done is gone on with.
 """
 
@@ -156,17 +157,18 @@ def some_lags(model: PeptideSlide, generator: torch.Generator) -> Tensor:
     return lag_ps * torch.arange(1, 1 + (most if whole else int(torch.randint(1, 1 + most, (1,), generator=generator))))
 
 
-def teach(start: Path, out: Path, n_molecules: int, steps: int) -> Path:
-    """Write weights that keep the equilibrium of those of `start`. Raises SimulationError when training diverges."""
-    weights = load_weights(start)
-    teacher, model = (cast(PeptideSlide, w.model) for w in (weights, load_weights(start)))
+def teach(start: Path, out: Path, n_molecules: int, steps: int, equilibrium: Path | None = None) -> Path:
+    """Write weights that keep the equilibrium of those of `start`, or of others. Raises SimulationError when training
+    diverges."""
+    weights, source = load_weights(start), load_weights(equilibrium or start)
+    teacher, endless_teacher, model = (cast(PeptideSlide, w.model) for w in (weights, source, load_weights(start)))
     model.requires_grad_(True)
     sequences = [peptide.sequence for peptide in wide_peptides()]
     trained, held = sequences[:n_molecules], sequences[max(n_molecules, len(sequences) - _HELD) :]
 
     @cache
     def frames_of(sequence: str) -> Equilibrium:
-        return Equilibrium.of(teacher, sequence)
+        return Equilibrium.of(endless_teacher, sequence)
 
     def loss(generator: torch.Generator) -> tuple[Tensor, dict[str, Tensor]]:
         frames = frames_of(trained[int(torch.randint(len(trained), (1,), generator=generator))])
@@ -174,7 +176,7 @@ def teach(start: Path, out: Path, n_molecules: int, steps: int) -> Path:
         endless = bool(torch.rand(1, generator=generator) < _ENDLESS_SHARE)
         forgotten = torch.full((_ENDLESS_FRAMES,), model.config.forgotten_ps)
         times = forgotten if endless else some_lags(model, generator)
-        found = step(model, teacher, frames, rows, times, generator)
+        found = step(model, endless_teacher if endless else teacher, frames, rows, times, generator)
         total = found.divergence if endless else found.divergence + _BALANCE * found.loss
         return total, {"divergence": found.divergence.detach(), "unbalanced": found.loss.detach()}
 
@@ -195,13 +197,11 @@ def teach(start: Path, out: Path, n_molecules: int, steps: int) -> Path:
         return curves
 
     def write(spent_s: list[float]) -> None:
-        settings = {
-            "keeps_equilibrium": True,
-            "steps": steps,
-            "molecules": n_molecules,
-            "spent_s": round(sum(spent_s), 1),
-        }
-        save_weights(out, model, weights.domain, provenance_of({}, settings, weights), half=True)
+        settings = {"keeps_equilibrium": True, "steps": steps, "molecules": n_molecules,
+                    "spent_s": round(sum(spent_s), 1)}  # fmt: skip
+        if equilibrium is not None:
+            settings |= {"equilibrium": source.hash, "umbrella_states": source.provenance["umbrella_states"]}
+        save_weights(out, model, source.domain, provenance_of({}, settings, weights), half=True)
 
     stage = StageConfig("equilibrium", _WINDOWS, _RATE, None, steps, bf16=False, validate_every_s=_VALIDATE_S)
     train_stages([Stage(model.jumps, stage, loss, validate)], out, write, device=torch.device("cpu"), resume=True)
@@ -212,10 +212,12 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("out", type=Path)
     parser.add_argument("--weights", required=True)
+    parser.add_argument("--equilibrium")
     parser.add_argument("--molecules", type=int, default=500)
     parser.add_argument("--steps", type=int, default=3600)
     a = parser.parse_args(arguments)
-    teach(weights_path(a.weights), a.out, a.molecules, a.steps)
+    equilibrium = None if a.equilibrium is None else weights_path(a.equilibrium)
+    teach(weights_path(a.weights), a.out, a.molecules, a.steps, equilibrium)
 
 
 if __name__ == "__main__":

@@ -7,9 +7,10 @@
 CAMPAIGN is a folder of `peptide_campaign --umbrella --solvent obc2`. `record` adds its molecules to
 `umbrella_states.npz`: of each half of the runs, what states all torsions are in at once, drawn as often as frames count
 at equilibrium. Nothing else is kept of this MD, and the campaign leaves out what the record holds. `teach` trains the
-probabilities at endless times on it, but those of the signs of phi; by steps, and of molecules that WEIGHTS were
-trained on, they are to stay what they were. One molecule in eight is left out. `compare` says how far populations at
-endless times are from those of MD, of molecules learned and left out. Steps are taught by `peptide_equilibrium`.
+probabilities at endless times on it, but those of the signs of phi; of molecules that WEIGHTS were trained on they are
+to stay what they were. One molecule in eight is left out. `compare` says how far populations at endless times are from
+those of MD, of molecules learned and left out. Weights so taught are for endless times alone: `peptide_equilibrium`
+teaches steps to keep what they draw.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ from typing import Any, NamedTuple, cast
 import numpy as np
 import numpy.typing as npt
 import torch
-from peptide_equilibrium import Equilibrium, some_lags, step
+from peptide_equilibrium import Equilibrium, step
 from peptide_list import held_out_peptides, training_peptides, unseen_peptides, wide_peptides
 from torch import Tensor
 
@@ -47,9 +48,8 @@ RECORD = Path(__file__).with_name("umbrella_states.npz")
 DRAWS = 2048
 LEFT_OUT = 8
 _WINDOWS, _TIMES, _RATE, _DROPPED, _VALIDATE_S = 256, 4, 1e-3, 0.2, 60.0
-# The shares of steps that learn from the record, and that keep endless times of so many molecules learned before; the
-# others keep steps of 1 ps to 1 ns of all these, whose probabilities count so many times more.
-_LEARNING, _KEEPING, _KNOWN, _STAYING = 0.35, 0.15, 120, 10.0
+# The share of training that keeps what is drawn of so many molecules known before.
+_KEEPING, _KNOWN = 0.4, 150
 
 
 class Md(NamedTuple):
@@ -160,42 +160,35 @@ def teach(out: Path, start: Weights, steps: int, some: Sequence[Md]) -> Path:
     learned, left_out = parted(some)
     teacher, model = (cast(PeptideSlide, w.model) for w in (start, load_weights(start.path)))
     model.requires_grad_(True)
-    new = {md.sequence for md in some}
-    known = [sequence for sequence in start.domain.sequences if sequence not in new]
+    names = {md.sequence for md in some}
+    known = [sequence for sequence in start.domain.sequences if sequence not in names]
     known = random.Random(0).sample(known, min(_KNOWN, len(known)))
-    steps_of = [*known, *(md.sequence for md in learned)]
+    times = torch.full((_TIMES,), model.config.forgotten_ps)
 
     @cache
     def frames_of(sequence: str) -> Equilibrium:
         return Equilibrium.of(teacher, sequence)
 
-    def pick(n: int, generator: torch.Generator, k: int = 1) -> Tensor:
-        return torch.randint(n, (k,), generator=generator)
-
     def of_record(md: Md, generator: torch.Generator, dropped: float) -> Tensor:
-        frames = frames_of(md.sequence)
-        rows = pick(len(frames.states), generator, _WINDOWS)
-        laid = md.laid(frames.chain)
-        later = laid[pick(len(laid), generator, _WINDOWS * _TIMES)].unflatten(0, (_WINDOWS, _TIMES))
-        states = torch.cat([frames.states[rows][:, None], later], dim=1)
-        share = torch.ones(_WINDOWS, len(frames.chain.places), MOST_TORSIONS)
+        frames, n = frames_of(md.sequence), _WINDOWS * _TIMES
+        rows = torch.randint(len(frames.states), (_WINDOWS,), generator=generator)
+        laid = md.laid(frames.chain)[torch.randint(2 * DRAWS, (n,), generator=generator)]
+        states = torch.cat([frames.states[rows][:, None], laid.unflatten(0, (_WINDOWS, _TIMES))], dim=1)
+        share = torch.ones(_WINDOWS, *frames.chain.stated.counts.shape)
         share[:, frames.chain.signed, 0] = 0.0
-        times = torch.full((_WINDOWS, _TIMES), model.config.forgotten_ps)
-        given = frames.chain, frames.observed[rows], states, times, generator
+        given = frames.chain, frames.observed[rows], states, times.expand(_WINDOWS, -1), generator
         return state_loss(model, *given, share=share, dropped=dropped)
 
     def loss(generator: torch.Generator) -> tuple[Tensor, dict[str, Tensor]]:
-        what = float(torch.rand(1, generator=generator))
-        if what < _LEARNING:
-            found = of_record(learned[int(pick(len(learned), generator))], generator, _DROPPED)
+        keeping = known and torch.rand(1, generator=generator) < _KEEPING
+        place = float(torch.rand(1, generator=generator))
+        if not keeping:
+            found = of_record(learned[int(place * len(learned))], generator, _DROPPED)
             return found, {"states": found.detach()}
-        endless = what < _LEARNING + _KEEPING
-        times = torch.full((_TIMES,), model.config.forgotten_ps) if endless else some_lags(model, generator)
-        sequences = known if endless else steps_of
-        frames = frames_of(sequences[int(pick(len(sequences), generator))])
-        rows = pick(len(frames.states), generator, _WINDOWS)
+        frames = frames_of(known[int(place * len(known))])
+        rows = torch.randint(len(frames.states), (_WINDOWS,), generator=generator)
         found = step(model, teacher, frames, rows, times, generator).divergence
-        return (1.0 if endless else _STAYING) * found, {"divergence": found.detach()}
+        return found, {"divergence": found.detach()}
 
     @torch.no_grad()
     def validate() -> dict[str, float]:
@@ -205,15 +198,6 @@ def teach(out: Path, start: Weights, steps: int, some: Sequence[Md]) -> Path:
             curves |= {f"validation_{name}_{what}": value for what, value in found.items()}
             each = [float(of_record(md, torch.Generator().manual_seed(0), 0.0)) for md in part]
             curves[f"validation_{name}_states"] = float(np.mean(each))
-        for lag_ps in (10.0, 100.0):
-            times, steps = lag_ps * torch.arange(1, 5), []
-            for frames in (frames_of(md.sequence) for md in left_out):
-                rows, generator = torch.arange(len(frames.states)), torch.Generator().manual_seed(0)
-                steps.append(step(model, teacher, frames, rows, times, generator))
-            counted = sum(float(each.counts.sum()) for each in steps)
-            faster = sum(float((each.counts * each.faster.mean(0)).sum()) for each in steps) / counted
-            divergence = float(np.mean([float(each.divergence) for each in steps]))
-            curves |= {f"validation_divergence_{lag_ps:g}ps": divergence, f"validation_faster_{lag_ps:g}ps": faster}
         return curves
 
     def write(spent_s: list[float]) -> None:
