@@ -5,7 +5,7 @@ endless times, and as those in which steps end up. Both are learned from the sam
 from MD of molecules never seen; those of E, by `peptide_states`, by less still. A copy is trained to keep these by
 steps of 1 ps to 1 ns: of frames drawn at endless times as many are to go from one state of a torsion to another as come
 back (detailed balance), both together as many as before, and apart from that its probabilities are to stay what they
-were. Frames are those of `--molecules` of the wide campaign, of which the weights may know none; of the last of these,
+were. Frames are those of `--molecules` of the wide campaign, of which the weights may know none; of its last ones,
 which play no part, the curves show how far it is from balance.
 It is the first solvent that is taught; signs of phi stay as they are. What is in OUT half done is gone on with.
 """
@@ -42,7 +42,7 @@ _WINDOWS, _ENDLESS_SHARE, _ENDLESS_FRAMES = 256, 0.15, 4
 # What detailed balance counts beside what probabilities were, the square of a logarithm beside a divergence; states in
 # which fewer frames are say nothing, and how far, squared, sequences differ.
 _BALANCE, _LEAST_FRAMES, _DIFFER = 3.0, 3.0, 0.05
-_RATE, _HELD, _VALIDATE_S, _VALIDATED = 4e-4, 16, 120.0, ((10.0, 8), (100.0, 8), (1000.0, 1))
+_RATE, _HELD, _VALIDATE_S, _VALIDATED = 6e-4, 16, 120.0, ((10.0, 8), (100.0, 8), (1000.0, 1))
 
 
 class Equilibrium(NamedTuple):
@@ -164,7 +164,8 @@ def teach(start: Path, out: Path, n_molecules: int, steps: int, equilibrium: Pat
     teacher, endless_teacher, model = (cast(PeptideSlide, w.model) for w in (weights, source, load_weights(start)))
     model.requires_grad_(True)
     sequences = [peptide.sequence for peptide in wide_peptides()]
-    trained, held = sequences[:n_molecules], sequences[max(n_molecules, len(sequences) - _HELD) :]
+    trained, held = sequences[:-_HELD], sequences[-_HELD:]
+    trained = trained[:: max(1, len(trained) // n_molecules)][:n_molecules]
 
     @cache
     def frames_of(sequence: str) -> Equilibrium:
@@ -213,8 +214,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("out", type=Path)
     parser.add_argument("--weights", required=True)
     parser.add_argument("--equilibrium")
-    parser.add_argument("--molecules", type=int, default=500)
-    parser.add_argument("--steps", type=int, default=3600)
+    parser.add_argument("--molecules", type=int, default=160)
+    parser.add_argument("--steps", type=int, default=1600)
     a = parser.parse_args(arguments)
     equilibrium = None if a.equilibrium is None else weights_path(a.equilibrium)
     teach(weights_path(a.weights), a.out, a.molecules, a.steps, equilibrium)

@@ -1,7 +1,7 @@
 """States of peptides' torsions in OBC2, of MD under an umbrella potential: kept as a record, learned, and compared.
 
     python docs/studies/training/peptide_states.py record CAMPAIGN
-    python docs/studies/training/peptide_states.py teach OUT.safetensors --weights WEIGHTS [--steps 3000]
+    python docs/studies/training/peptide_states.py teach OUT.safetensors --weights WEIGHTS [--steps 600]
     python docs/studies/training/peptide_states.py compare [--weights WEIGHTS]
 
 CAMPAIGN is a folder of `peptide_campaign --umbrella --solvent obc2`. `record` adds its molecules to
@@ -47,9 +47,9 @@ RECORD = Path(__file__).with_name("umbrella_states.npz")
 # Of each half of the runs of a molecule.
 DRAWS = 2048
 LEFT_OUT = 8
-_WINDOWS, _TIMES, _RATE, _DROPPED, _VALIDATE_S = 256, 4, 1e-3, 0.2, 60.0
+_WINDOWS, _TIMES, _RATE, _DROPPED, _VALIDATE_S = 256, 4, 5e-4, 0.2, 30.0
 # The share of training that keeps what is drawn of so many molecules known before.
-_KEEPING, _KNOWN = 0.4, 150
+_KEEPING, _KNOWN = 0.4, 40
 
 
 class Md(NamedTuple):
@@ -214,7 +214,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("what", choices=("record", "teach", "compare"))
     parser.add_argument("path", type=Path, nargs="?")
     parser.add_argument("--weights", default="peptides")
-    parser.add_argument("--steps", type=int, default=3000)
+    parser.add_argument("--steps", type=int, default=600)
     a = parser.parse_args(arguments)
     if a.path is None and a.what != "compare":
         parser.error(f"{a.what} needs a path.")
