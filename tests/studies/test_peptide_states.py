@@ -32,9 +32,9 @@ def test_an_umbrella_is_of_molecules_that_no_run_of_the_first_ones_shows(monkeyp
     assert "PRO-CYS" in names and "TRP-HIE" not in names and len(names) == len(wide_peptides()) - 184 - 1
     assert not names & {p.name for p in wide_peptides()[:184]}
     assert not {p.residues for p in order} & {p.residues for p in (*unseen_peptides(), *held_out_peptides())}
-    long = [len(p.residues) > 2 for p in order]
-    assert long == sorted(long) and {p.time_ps for p in order} == {800.0}
-    learned, left_out = ({md.name for md in part} for part in parted([Md(name, np.zeros(0)) for name in names]))
+    pairs = [len(p.residues) == 2 for p in order]
+    assert pairs == sorted(pairs) and sum(pairs) > 150 and {p.time_ps for p in order} == {800.0}
+    learned, left_out = ({md.name for md in part} for part in parted([Md(n, np.zeros(1)) for n in names]))
     assert len(order) / 10 < len(left_out) < len(order) / 7 and learned | left_out == names and not learned & left_out
     assert not {tuple(name.removeprefix("free-").split("-")) for name in left_out} & {
         p.residues for p in training_peptides()
@@ -64,10 +64,15 @@ def test_halves_of_runs_are_kept_apart(tmp_path: Path, monkeypatch: pytest.Monke
     monkeypatch.setattr(peptide_states, "load_ensemble", lambda _: md)
     (place := tmp_path / "umbrella" / "CYS").mkdir(parents=True)
     (place / "run_000.h5").touch()
+    monkeypatch.setattr(peptide_states, "LEAST_COUNTED", 119.0)
     gather(tmp_path, model, record := tmp_path / "record.npz")
     (found,) = read(record)
     helices = [float((half[:, 1, 1] == 1).float().mean()) for half in found.laid(chain).split(DRAWS)]
     assert sorted(helices) == pytest.approx([0.0, 1.0], abs=0.01)
+    # Half of the 240 frames count. Where that is too few, the name stays.
+    monkeypatch.setattr(peptide_states, "LEAST_COUNTED", 121.0)
+    gather(tmp_path, model, other := tmp_path / "other.npz")
+    assert [md.name for md in read(other)] == ["CYS"] and parted(read(other)) == ([], [])
 
 
 def test_weights_learn_states_at_endless_times(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

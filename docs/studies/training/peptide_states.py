@@ -44,8 +44,8 @@ from systems.errors import InputError
 from systems.trajectory.codec import frame_factors
 
 RECORD = Path(__file__).with_name("umbrella_states.npz")
-# Of each half of the runs of a molecule.
-DRAWS = 2048
+# Of each half of the runs of a molecule; of runs of which fewer frames count in effect nothing is kept but the name.
+DRAWS, LEAST_COUNTED = 2048, 100.0
 LEFT_OUT = 8
 _WINDOWS, _TIMES, _RATE, _DROPPED, _VALIDATE_S = 256, 4, 5e-4, 0.2, 30.0
 # The share of training that keeps what is drawn of so many molecules known before.
@@ -105,9 +105,9 @@ def gather(campaign: Path, model: PeptideSlide, record: Path = RECORD) -> None:
         states = [chain.states(torch.from_numpy(x))[:, at[0], at[1]].numpy().astype(np.uint8) for x in md.segments]
         factors = frame_factors(md.differences_kj_mol, 300.0)
         halves = [drawn(np.concatenate(states[k::2]), np.concatenate(factors[k::2])) for k in (0, 1)]
-        kept[place.name] = np.stack(halves)
         every = np.concatenate(factors)
         counted = every.sum() ** 2 / (every**2).sum()
+        kept[place.name] = np.stack(halves)[:, : DRAWS if counted >= LEAST_COUNTED else 0]
         sys.stdout.write(f"{place.name}: {len(every)} frames, of which {counted:.0f} count\n")
     by_name: dict[str, Any] = {name: kept[name] for name in sorted(kept)}
     np.savez_compressed(record, **by_name)
@@ -142,10 +142,11 @@ def errors(model: PeptideSlide, some: Iterable[tuple[Md, Equilibrium]]) -> dict[
 
 
 def parted(some: Sequence[Md]) -> tuple[list[Md], list[Md]]:
-    """Return those that are learned, and those left out: by their places in the wide campaign, so that they stay what
-    they are as the record grows, and only where no earlier training saw their residues."""
+    """Return, of those with enough MD, what is learned and what is left out: by places in the wide campaign, so that
+    they stay what they are as the record grows, and only where no earlier training saw their residues."""
     first = {p.residues for p in training_peptides()}
     out = {p.name for k, p in enumerate(wide_peptides()) if k % LEFT_OUT == 0 and p.residues not in first}
+    some = [md for md in some if md.states.size]
     return [md for md in some if md.name not in out], [md for md in some if md.name in out]
 
 
