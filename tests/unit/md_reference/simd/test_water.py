@@ -234,7 +234,7 @@ def test_waters_trade_places_without_moving(monkeypatch: pytest.MonkeyPatch) -> 
         monkeypatch.setattr(force_field, "_TRADED_NM", reach)
         run = started("alanine-dipeptide", timestep_ps=0.004)
         before = run.positions_nm
-        for _ in range(30):
+        for _ in range(40):
             run.step(40)
             now = run.positions_nm
             assert np.abs(now - before).max() < 0.4  # 160 fs; a cell is 2.15 nm wide
