@@ -81,9 +81,10 @@ def test_weights_learn_states_at_endless_times(tmp_path: Path, monkeypatch: pyte
     monkeypatch.setattr(peptide_states, "_RATE", 1e-2)
     some = wide_peptides()[:2]
     monkeypatch.setattr(peptide_states, "wide_peptides", lambda: some)
-    monkeypatch.setattr(peptide_states, "LEFT_OUT", 1000)
-    monkeypatch.setattr(peptide_states, "parted", lambda some: (list(some), list(some)))
     start = load_weights(weights_path("peptides"))
+    with pytest.raises(InputError, match="0 molecules to learn and 0 left out"):
+        teach(tmp_path / "nothing.safetensors", start, 1, [])
+    monkeypatch.setattr(peptide_states, "parted", lambda some: (list(some), list(some)))
     start = replace(start, domain=replace(start.domain, sequences=("ACE-GLY-NME",)))
     begun = cast(PeptideSlide, start.model)
     frames = Equilibrium.of(begun, some[0].sequence, seed=1)

@@ -157,8 +157,11 @@ def with_sequences(domain: TrainingDomain, some: Sequence[Md]) -> TrainingDomain
 
 
 def teach(out: Path, start: Weights, steps: int, some: Sequence[Md]) -> Path:
-    """Write weights that draw the record's states at endless times. Raises SimulationError when training diverges."""
+    """Write weights that draw the record's states at endless times. Raises InputError for a record of which nothing is
+    learned or nothing left out, and SimulationError when training diverges."""
     learned, left_out = parted(some)
+    if not learned or not left_out:
+        raise InputError(f"{RECORD}: {len(learned)} molecules to learn and {len(left_out)} left out; record more.")
     teacher, model = (cast(PeptideSlide, w.model) for w in (start, load_weights(start.path)))
     model.requires_grad_(True)
     names = {md.sequence for md in some}
