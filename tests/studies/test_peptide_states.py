@@ -73,6 +73,8 @@ def test_halves_of_runs_are_kept_apart(tmp_path: Path, monkeypatch: pytest.Monke
     monkeypatch.setattr(peptide_states, "LEAST_COUNTED", 121.0)
     gather(tmp_path, model, other := tmp_path / "other.npz")
     assert [md.name for md in read(other)] == ["CYS"] and parted(read(other)) == ([], [])
+    with pytest.raises(SystemExit, match="holds no MD under an umbrella potential"):
+        gather(tmp_path / "nowhere", model, record)
 
 
 def test_weights_learn_states_at_endless_times(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -98,6 +100,7 @@ def test_weights_learn_states_at_endless_times(tmp_path: Path, monkeypatch: pyte
             wanted[..., k] = rng.integers(0, 3, (2, DRAWS))
     md = Md("ALA", wanted)
     taught = load_weights(teach(tmp_path / "taught.safetensors", start, 60, [md]))
+    assert taught.domain.sequences == ("ACE-GLY-NME", "ACE-ALA-NME") and taught.provenance["umbrella_states"] == 1
     model = cast(PeptideSlide, taught.model)
     before, after = (errors(m, [(md, frames)])["off"] for m in (begun, model))
     assert before > 20.0 and after < 8.0

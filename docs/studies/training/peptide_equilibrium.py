@@ -6,8 +6,8 @@ from MD of molecules never seen; those of E, by `peptide_states`, by less still.
 steps of 1 ps to 1 ns: of frames drawn at endless times as many are to go from one state of a torsion to another as come
 back (detailed balance), both together as many as before, and apart from that its probabilities are to stay what they
 were. Frames are those of `--molecules` of the wide campaign, of which the weights may know none; of its last ones,
-which play no part, the curves show how far it is from balance.
-It is the first solvent that is taught; signs of phi stay as they are. What is in OUT half done is gone on with.
+which play no part, the curves show how far it is from balance. It is the first solvent that is taught; signs of phi
+stay as they are. What is in OUT half done is gone on with.
 """
 
 from __future__ import annotations
@@ -201,7 +201,7 @@ def teach(start: Path, out: Path, n_molecules: int, steps: int, equilibrium: Pat
         settings = {"keeps_equilibrium": True, "steps": steps, "molecules": n_molecules,
                     "spent_s": round(sum(spent_s), 1)}  # fmt: skip
         if equilibrium is not None:
-            settings |= {"equilibrium": source.hash, "umbrella_states": source.provenance["umbrella_states"]}
+            settings |= {"equilibrium": source.hash, "umbrella_states": source.provenance.get("umbrella_states", 0)}
         save_weights(out, model, source.domain, provenance_of({}, settings, weights), half=True)
 
     stage = StageConfig("equilibrium", _WINDOWS, _RATE, None, steps, bf16=False, validate_every_s=_VALIDATE_S)

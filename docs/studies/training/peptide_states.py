@@ -28,6 +28,7 @@ from typing import Any, NamedTuple, cast
 import numpy as np
 import numpy.typing as npt
 import torch
+import torch.nn.functional as F
 from peptide_equilibrium import Equilibrium, step
 from peptide_list import held_out_peptides, training_peptides, unseen_peptides, wide_peptides
 from torch import Tensor
@@ -94,7 +95,10 @@ def read(record: Path = RECORD) -> list[Md]:
 def gather(campaign: Path, model: PeptideSlide, record: Path = RECORD) -> None:
     """Add the molecules of a campaign to a record."""
     kept = {md.name: md.states for md in read(record)}
-    for place in sorted((campaign / "umbrella").glob("*")):
+    places = sorted((campaign / "umbrella").glob("*"))
+    if not places:
+        raise SystemExit(f"{campaign} holds no MD under an umbrella potential; name a folder of peptide_campaign.")
+    for place in places:
         files = sorted(place.glob("run_*.h5"))
         if place.name in kept or not files:
             continue
@@ -119,7 +123,7 @@ def shares(states: Tensor, chain: ChainFeatures) -> Tensor:
     kept = states[(states[..., 0] == 0).all(dim=1)]
     side = chain.stated.slot > 0
     own = kept[:, chain.stated.residue[side], chain.stated.slot[side]]
-    return torch.nn.functional.one_hot(own, MOST_STATES).double().mean(dim=0)
+    return F.one_hot(own, MOST_STATES).double().mean(dim=0)
 
 
 @torch.no_grad()
