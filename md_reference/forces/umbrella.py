@@ -68,11 +68,15 @@ class Umbrella:
 
     def energies_kj_mol(self, positions_nm: npt.ArrayLike) -> FloatArray:
         """Return the energies `(n,)` of that force in frames `(n, n_atoms, 3)`."""
-        import numpy as np
-
         from systems.chemistry.geometry import torsion
 
-        angles = np.asarray(torsion(positions_nm, self.torsions), dtype=np.float64)
+        return self.energies_of(torsion(positions_nm, self.torsions))
+
+    def energies_of(self, angles_rad: npt.ArrayLike) -> FloatArray:
+        """Return the energies `(n,)` at angles `(n, k)` of the torsions."""
+        import numpy as np
+
+        angles = np.asarray(angles_rad, dtype=np.float64)
         found = np.zeros(len(angles))
         for column, series in zip(angles.T, self.series_kj_mol, strict=True):
             for n, (a, b) in enumerate(zip(series[::2], series[1::2], strict=True), 1):

@@ -192,17 +192,23 @@ def _is_bf16(module: nn.Module) -> bool:
     return isinstance(module, nn.Linear) and module.weight.dtype == torch.bfloat16
 
 
+def _can_pack() -> bool:
+    """True where packed weights in bf16 are multiplied: not by builds of torch for ARM and some others, nor by
+    processors without AVX-512."""
+    mkldnn = torch.ops.mkldnn
+    can = torch.backends.mkldnn.is_available() and hasattr(mkldnn, "_reorder_linear_weight")
+    return can and bool(mkldnn._is_mkldnn_bf16_supported())
+
+
 class PackedLinear(nn.Module):
-    """`torch.nn.Linear`, its weight packed where it is bf16 and torch has oneDNN; elsewhere plain."""
+    """`torch.nn.Linear`, its weight packed where it is bf16 and that is multiplied; elsewhere plain."""
 
     bias: Tensor | None
 
     def __init__(self, weight: Tensor, bias: Tensor | None) -> None:
         super().__init__()
         self.dtype = weight.dtype
-        # Builds of torch for ARM and some others do not multiply packed weights.
-        can_pack = torch.backends.mkldnn.is_available() and hasattr(torch.ops.mkldnn, "_reorder_linear_weight")
-        self.packed = can_pack and weight.dtype == torch.bfloat16
+        self.packed = weight.dtype == torch.bfloat16 and _can_pack()
         weight = weight.detach().contiguous()
         packed = torch.ops.mkldnn._reorder_linear_weight(weight, _ROWS) if self.packed else weight
         self.weight = nn.Buffer(packed, persistent=False)
@@ -211,7 +217,7 @@ class PackedLinear(nn.Module):
     def forward(self, x: Tensor) -> Tensor:
         """`(..., n_in)` of any precision -> `(..., n_out)` in the weight's."""
         if not self.packed:
-            return F.linear(x, self.weight, self.bias)
+            return F.linear(x.to(self.dtype), self.weight, self.bias)
         multiply = torch.ops.mkldnn._linear_pointwise.default
         return cast(Tensor, multiply(x.to(self.dtype), self.weight, self.bias, "none", [], ""))
 

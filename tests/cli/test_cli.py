@@ -28,15 +28,19 @@ HEAVY = ["numpy", "torch", "openmm", "h5py", "mdtraj", "rdkit", "scipy", "matplo
 # ---- starting ------------------------------------------------------------------------------------------------------
 
 
-def test_help_takes_less_than_half_a_second_of_processor_time() -> None:
-    spent = []
+def test_help_takes_little_longer_than_that_of_a_program_of_one_command(tmp_path: Path) -> None:
+    """Side by side, in processor time, so that a slow or busy machine makes no difference."""
+    bare = tmp_path / "bare.py"
+    bare.write_text("import typer\n\ndef only(name: str) -> None:\n    ...\n\ntyper.run(only)\n")
+    spent: dict[str, list[float]] = {"ours": [], "bare": []}
     for _ in range(3):
-        before = resource.getrusage(resource.RUSAGE_CHILDREN)
-        done = subprocess.run([*SURROMD, "--help"], capture_output=True, text=True, check=True)
-        after = resource.getrusage(resource.RUSAGE_CHILDREN)
-        spent.append(after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime)
-        assert all(command in done.stdout for command in COMMANDS)
-    assert min(spent) < 0.5, f"{spent} s"
+        for name, program in (("ours", SURROMD), ("bare", [sys.executable, str(bare)])):
+            before = resource.getrusage(resource.RUSAGE_CHILDREN)
+            done = subprocess.run([*program, "--help"], capture_output=True, text=True, check=True)
+            after = resource.getrusage(resource.RUSAGE_CHILDREN)
+            spent[name].append(after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime)
+            assert name == "bare" or all(command in done.stdout for command in COMMANDS)
+    assert min(spent["ours"]) < 1.9 * min(spent["bare"]), f"{spent} s"
 
 
 def test_starting_loads_no_heavy_library() -> None:

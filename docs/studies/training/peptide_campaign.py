@@ -13,11 +13,11 @@ tests are made of, these tests, the other monomers, two pairs with free ends and
 the rest of pairs with every residue once at either place, further tests, pairs and chains, then more runs of all. What
 is there is left alone and what was stopped goes on.
 
-`--umbrella`: under an umbrella potential of psi and side chains, which MD in OBC2 of 1.2 ns a replica tells (in OBC2 of
-0.5 ns), from its frames with phi < 0: `FOLDER/umbrella/NAME`. They are for populations of torsion states, not for
-rates. In water these are capped pairs, those of tests in `umbrella_test`, but for what `peptide_populations` holds; in
-OBC2 what the wide campaign comes to last, which weights trained on its first molecules never saw, but for what
-`peptide_states` holds.
+`--umbrella`: under an umbrella potential of psi and side chains, from frames with phi < 0: `FOLDER/umbrella/NAME`. For
+water MD in OBC2 of 1.2 ns a replica tells it, for OBC2 frames drawn by the shipped weights. Such MD is for populations
+of torsion states, not for rates. In water these are capped pairs, those of tests in `umbrella_test`, but for what
+`peptide_populations` holds; in OBC2 what the wide campaign comes to last, which weights trained on its first molecules
+never saw, but for what `peptide_states` holds.
 """
 
 from __future__ import annotations
@@ -28,10 +28,11 @@ from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import peptide_states
+from peptide_equilibrium import Equilibrium
 from peptide_list import (
     FIRST_TESTS,
     RESIDUES,
@@ -51,11 +52,15 @@ from md_reference.forces.umbrella import Umbrella, umbrella_torsions
 from md_reference.run.config import SIMD, Conditions, MDConfig
 from md_reference.run.engine import Engine
 from md_reference.simd.force_field import SimdReplicas, n_replicas
+from surrogate.models.architecture import weights_path
 from surrogate.models.peptides.chains import POSITIVE_PHI_DEG
+from surrogate.models.peptides.model import PeptideSlide
+from surrogate.models.weights import load_weights
 from systems.chemistry.geometry import torsion
 from systems.chemistry.graph import backbone_torsions, rotatable_torsions
 from systems.prepare.peptide import build_peptide
 from systems.scene import FloatArray, IntArray, Scene
+from systems.units import GAS_CONSTANT_KJ_MOL_K
 
 WATER, IMPLICIT = ForceFieldSpec("ff14SB", "tip3p"), ForceFieldSpec("ff14SB", "obc2")
 # In water. Pairs and chains are trained on in no solvent; monomers are tested on runs of their own.
@@ -75,7 +80,11 @@ HOT_K, HOT_PS, COOL_PS = 500.0, 100.0, 100.0
 TURNED_PS, STIFFNESS_KJ_MOL = 20.0, 300.0
 # For an umbrella potential: the MD in OBC2 that tells it, its first part left out where starts are drawn, and the runs
 # in water.
-RESOLVED_PS, RESOLVED_EVERY_PS, RELAXED = {"tip3p": 1200.0, "obc2": 500.0}, 0.4, 0.2
+RESOLVED_PS, RESOLVED_EVERY_PS, RELAXED = 1200.0, 0.4, 0.2
+# The share of frames that is to count in effect: of longer chains more of the free energies is left, in steps, in kT.
+# Frames drawn that tell one in OBC2, and how long their bonds take to settle.
+COUNTING, LIGHTER_KT = 0.2, 0.5
+DRAWN, SETTLED_PS = 4000, 2.0
 UMBRELLA_PS, UMBRELLA_TEST_PS = 200.0, 500.0
 # In OBC2: of what the wide campaign has after so many molecules. Chains come first: weights that learned 85 molecules,
 # all pairs, came nearer to pairs and farther from chains.
@@ -109,25 +118,57 @@ def many_states(dry: Scene, seed: int) -> FloatArray:
     return cool.positions_nm
 
 
-def umbrella_of(dry: Scene, seed: int, resolved_ps: float) -> tuple[Umbrella, FloatArray]:
-    """Return the umbrella potential of psi and side chains that MD in OBC2 of `resolved_ps` tells, and positions
+def umbrella_of(dry: Scene, seed: int) -> tuple[Umbrella, FloatArray]:
+    """Return the umbrella potential of psi and side chains that MD in OBC2 tells, and positions
     `(n_replicas, n_atoms, 3)` with every phi negative."""
-    system, phis = build_system(dry, IMPLICIT), backbone_torsions(dry)["phi"]
-    run = dynamics(system, 300.0, seed + 2, friction_per_ps=1.0, timestep_ps=0.004)
+    run = dynamics(build_system(dry, IMPLICIT), 300.0, seed + 2, friction_per_ps=1.0, timestep_ps=0.004)
     run.set_positions(many_states(dry, seed))
     run.thermalise()
     quads, left_kt = umbrella_torsions(dry)
     angles, starts = [], []
-    for k in range(n := round(resolved_ps / RESOLVED_EVERY_PS)):
+    for k in range(n := round(RESOLVED_PS / RESOLVED_EVERY_PS)):
         run.step(round(RESOLVED_EVERY_PS / run.timestep_ps))
-        x = run.positions_nm
-        angles.append(torsion(x, quads))
+        angles.append(torsion(run.positions_nm, quads))
         if k >= RELAXED * n:
-            phi = np.rad2deg(torsion(x, phis))
-            starts.append(x[~((phi > POSITIVE_PHI_DEG[0]) & (phi < POSITIVE_PHI_DEG[1])).any(axis=1)])
-    pool = np.concatenate(starts)
-    picks = np.random.default_rng(seed).choice(len(pool), run.n_replicas, replace=len(pool) < run.n_replicas)
-    return Umbrella.of(quads, np.concatenate(angles), left_kt, 300.0), pool[picks]
+            starts.append(with_negative_phi(dry, run.positions_nm))
+    return Umbrella.of(quads, np.concatenate(angles), left_kt, 300.0), some_of(np.concatenate(starts), seed)
+
+
+def drawn_umbrella_of(dry: Scene, sequence: str, seed: int) -> tuple[Umbrella, FloatArray]:
+    """Return the same, told by frames that the shipped weights draw at endless times."""
+    frames = Equilibrium.of(cast(PeptideSlide, load_weights(weights_path("peptides")).model), sequence, seed)
+    x, shares = frames.frames_nm.numpy().astype(np.float64), frames.weights.numpy().astype(np.float64)
+    rows = np.random.default_rng(seed).choice(len(x), DRAWN, p=shares / shares.sum())
+    quads, left_kt = umbrella_torsions(dry)
+    run = dynamics(build_system(dry, IMPLICIT), 300.0, seed + 2, timestep_ps=0.0005)
+    run.set_positions(some_of(with_negative_phi(dry, x), seed))
+    run.thermalise()
+    run.step(round(SETTLED_PS / run.timestep_ps))
+    return light_umbrella(quads, np.asarray(torsion(x[rows], quads)), left_kt), run.positions_nm
+
+
+def with_negative_phi(dry: Scene, x: FloatArray) -> FloatArray:
+    """Return those of frames `(n, n_atoms, 3)` in which every phi is negative."""
+    phi = np.rad2deg(torsion(x, backbone_torsions(dry)["phi"]))
+    return x[~((phi > POSITIVE_PHI_DEG[0]) & (phi < POSITIVE_PHI_DEG[1])).any(axis=1)]
+
+
+def some_of(frames: FloatArray, seed: int) -> FloatArray:
+    """Return as many as there are replicas."""
+    n = n_replicas()
+    return frames[np.random.default_rng(seed).choice(len(frames), n, replace=len(frames) < n)]
+
+
+def light_umbrella(quads: IntArray, angles: FloatArray, left_kt: list[float]) -> Umbrella:
+    """Return the umbrella potential of `quads` (k, 4) that leaves `left_kt` (k,) or as much more as COUNTING asks for,
+    by a sample `angles` (n, k) without it. Under U a share 1 / (<exp(U / kT)> <exp(-U / kT)>) counts."""
+    kt = GAS_CONSTANT_KJ_MOL_K * 300.0
+    while True:
+        umbrella = Umbrella.of(quads, angles, left_kt, 300.0)
+        u = umbrella.energies_of(angles) / kt
+        if np.exp(u).mean() * np.exp(-u).mean() * COUNTING <= 1.0:
+            return umbrella
+        left_kt = [left + LIGHTER_KT for left in left_kt]
 
 
 def starts_in_water(wet: Scene, quads: IntArray, angles: FloatArray, seed: int) -> FloatArray:
@@ -158,7 +199,9 @@ def batch(
         in_water = solvent == WATER.solvent
         scene = solvate(dry, WATER, WaterBox()) if in_water else dry
         seed = zlib.crc32(f"{'water' if in_water else solvent}:{peptide.name}:{number}".encode()) % (2**31 - 2)
-        umbrella, starts = umbrella_of(dry, seed, RESOLVED_PS[solvent]) if with_umbrella else (None, None)
+        umbrella, starts = None, None
+        if with_umbrella:
+            umbrella, starts = umbrella_of(dry, seed) if in_water else drawn_umbrella_of(dry, peptide.sequence, seed)
         if any(part.exists() for part in parts_of(folder, numbers)):
             starts = None
         else:

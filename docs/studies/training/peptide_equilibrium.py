@@ -46,10 +46,12 @@ _RATE, _HELD, _VALIDATE_S, _VALIDATED = 6e-4, 16, 120.0, ((10.0, 8), (100.0, 8),
 
 
 class Equilibrium(NamedTuple):
-    """Frames of a molecule that weights draw at endless times: its `chain`, numbers `observed` (n, r, slots), `states`
-    (n, r, MOST_TORSIONS), and what each counts `weights` (n,): rare states are drawn more often than they occur."""
+    """Frames `frames_nm` (n, n_atoms, 3) of a molecule that weights draw at endless times: its `chain`, numbers
+    `observed` (n, r, slots), `states` (n, r, MOST_TORSIONS), and what each counts `weights` (n,): rare states are drawn
+    more often than they occur."""
 
     chain: ChainFeatures
+    frames_nm: Tensor
     observed: Tensor
     states: Tensor
     weights: Tensor
@@ -60,7 +62,7 @@ class Equilibrium(NamedTuple):
         scene, generator = build_peptide(sequence), torch.Generator().manual_seed(seed)
         chain = chain_features(scene, model.config)
         built = torch.tensor(scene.positions_nm, dtype=torch.float32)[None]
-        found = cls(chain, *model.normalised(built, chain), torch.ones(1))
+        found = cls(chain, built, *model.normalised(built, chain), torch.ones(1))
         for n in (_FIRST, _FRAMES):
             found = found.later(model, n, generator)
         return found
@@ -83,7 +85,8 @@ class Equilibrium(NamedTuple):
         )
         frames, astray, crowded = mended(tokens[:, 0], states[chosen, 0], chain)
         kept = ~(astray | crowded)
-        return Equilibrium(chain, *model.normalised(frames[kept], chain), likely[chosen][kept].reciprocal().float())
+        frames, counting = frames[kept], likely[chosen][kept].reciprocal().float()
+        return Equilibrium(chain, frames, *model.normalised(frames, chain), counting)
 
 
 class Step(NamedTuple):

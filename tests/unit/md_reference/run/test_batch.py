@@ -15,6 +15,7 @@ from md_reference.run import replicas
 from md_reference.run.config import MDConfig
 from md_reference.run.plan import make_plan
 from md_reference.run.replicas import simulate_batch, simulate_replicas, where_left
+from md_reference.simd.force_field import n_replicas
 from systems.errors import InputError, SimulationError
 from systems.prepare.peptide import build_peptide
 from systems.trajectory.checkpoint import checkpoint_path
@@ -140,6 +141,7 @@ def test_replicas_are_counted_across_batches(tmp_path: Path, monkeypatch: pytest
 
 
 def test_the_plan_counts_replicas_that_run_at_once() -> None:
-    one, many = (make_plan(SCENE, CONFIG, replicas=n) for n in (1, 16))
+    n = n_replicas()
+    one, many = (make_plan(SCENE, CONFIG, replicas=k) for k in (1, n))
     assert many.rows["platform"] == "simd" and one.us_per_step is not None and many.us_per_step is not None
-    assert 8 < one.us_per_step / many.us_per_step < 32
+    assert n / 2 < one.us_per_step / many.us_per_step < 2 * n

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -28,7 +29,7 @@ from surrogate.sampling.simulation import KJ_MOL_PER_EV, LearnedForces
 from surrogate.verbs.info import rollout_lines
 from systems.chemistry.graph import match_atoms
 from systems.chemistry.validity import ENERGY, UNSURE, geometry_from_frames
-from systems.errors import InputError, OutOfDomainError, SurromdError
+from systems.errors import InputError, OutOfDomainError, SimulationError, SurromdError
 from systems.prepare.molecule import scene_from_smiles
 from systems.trajectory.codec import DIFFERENCE_COLUMN, open_trajectory
 
@@ -181,10 +182,14 @@ def test_a_short_annealing_ends_as_cold_as_a_long_one(tmp_path: Path, monkeypatc
         return float(model.evaluate(x, molecule).energy_kj_mol.mean())
 
     # Of some 45 degrees of freedom, half a kT each: 56 kJ/mol above the minimum, 2 of error.
-    long, short = energy(6.0), energy(1.0)
+    long, short = energy(4.0), energy(1.0)
     assert abs(short - long) < 10.0
     monkeypatch.setattr(runner, "_COOLINGS", 0.0)
-    assert energy(1.0) > long + 10.0, "negative control"
+    try:
+        hot = energy(1.0)
+    except SimulationError:  # 4 fs is too long where it is hot
+        hot = math.inf
+    assert hot > long + 10.0, "negative control"
 
 
 def test_torsion_moves_turn_what_md_does_not_and_no_frame_is_caught_for_it(tmp_path: Path) -> None:

@@ -350,8 +350,8 @@ def test_a_flow_is_taught_to_end_in_two_evaluations_where_it_ended_in_six(
     start = train_peptides([frames], tmp_path / "a.safetensors", SMALL, training)
     labeller = load_weights(start)
     apart = {}
-    for name, rate in (("still", 1e-12), ("taught", 1e-3)):
-        taught = replace(training, learning_rate=rate)
+    for name, rate, n in (("still", 1e-12, 1), ("taught", 1e-3, training.steps)):
+        taught = replace(training, learning_rate=rate, steps=n)
         out = distil([frames], load_weights(start), tmp_path / f"{name}.safetensors", taught, steps=2)
         with out.with_suffix(".csv").open() as curves:
             apart[name] = [float(row["validation_apart"]) for row in csv.DictReader(curves)][-1]
