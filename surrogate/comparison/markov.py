@@ -12,7 +12,7 @@ from __future__ import annotations
 import copy
 import math
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import pairwise
@@ -320,9 +320,12 @@ def _counts(micro: list[IntArray], units: list[tuple[int, int, int]], n: int, la
 
 def _components(counts: FloatArray) -> IntArray:
     """Return for each state which strongly connected set it is in; 0 is the one with most counts."""
+    if (counts > 0).all():
+        return np.zeros(len(counts), dtype=np.int64)
+    from scipy.sparse import csr_array
     from scipy.sparse.csgraph import connected_components
 
-    n, labels = connected_components(counts > 0, directed=True, connection="strong")
+    n, labels = connected_components(csr_array(counts > 0), directed=True, connection="strong")
     weight = np.bincount(labels, weights=counts.sum(0) + counts.sum(1), minlength=n)
     rank = np.empty(n, dtype=np.int64)
     rank[np.argsort(-weight, kind="stable")] = np.arange(n)
@@ -353,31 +356,35 @@ def reversible(counts: FloatArray, settled: float = 0.0) -> tuple[FloatArray, Fl
     both, out = counts + counts.T, counts.sum(1)
 
     def step(y: FloatArray) -> FloatArray:
-        with np.errstate(all="ignore"):  # a jump too far gives no numbers
-            w = out * np.exp(-y)
-            z = (both / (w[:, None] + w[None])).sum(1)
-            return np.asarray(np.log(z / z.sum()))
+        w = out * np.exp(-y)
+        z = np.add.reduce(both / (w[:, None] + w), 1)
+        return np.asarray(np.log(z / np.add.reduce(z)))
 
-    y = np.log(both.sum(1) / both.sum())
-    for _ in range(_MOST_STEPS):
-        first = step(y)
-        second = step(first)
-        r, v = first - y, second - 2.0 * first + y
-        if float(np.abs(r).max()) < _STEP_TOLERANCE or float((np.exp(y) * np.abs(r)).max()) < settled:
-            break
-        ratio = float(np.linalg.norm(r)) / max(float(np.linalg.norm(v)), 1e-300)
-        further = min(max(1.0, ratio), _FURTHEST)
-        jumped = step(y + 2.0 * further * r + further**2 * v)
-        # A jump too far is none.
-        good = bool(np.isfinite(jumped).all()) and np.abs(jumped - second).max() < _LONGEST_JUMP
-        y = jumped if good else second
-    else:
-        if not float((np.exp(y) * np.abs(r)).max()) < 10.0 * _SETTLED:
-            return None
+    with np.errstate(all="ignore"):  # a jump too far gives no numbers
+        y = _fixed_point(step, np.log(both.sum(1) / both.sum()), settled)
+    if y is None:
+        return None
     w = out * np.exp(-y)
     flux = both / (w[:, None] + w[None])
     total = flux.sum(1)
     return flux / total[:, None], total / total.sum()
+
+
+def _fixed_point(step: Callable[[FloatArray], FloatArray], y: FloatArray, settled: float) -> FloatArray | None:
+    """Return log populations that a step no longer changes, searched for from `y`; None where they are not found."""
+    for _ in range(_MOST_STEPS):
+        first = step(y)
+        second = step(first)
+        r, v = first - y, second - 2.0 * first + y
+        off = np.abs(r)
+        if float(off.max()) < _STEP_TOLERANCE or float((np.exp(y) * off).max()) < settled:
+            return y
+        ratio = math.sqrt(float(r @ r)) / max(math.sqrt(float(v @ v)), 1e-300)
+        further = min(max(1.0, ratio), _FURTHEST)
+        jumped = step(y + 2.0 * further * r + further**2 * v)
+        # A jump too far is none.
+        y = jumped if float(np.abs(jumped - second).max()) < _LONGEST_JUMP else second
+    return y if float((np.exp(y) * off).max()) < 10.0 * _SETTLED else None
 
 
 def _timescales(matrix: FloatArray, stationary: FloatArray, lag: int) -> tuple[FloatArray, FloatArray]:
