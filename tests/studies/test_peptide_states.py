@@ -9,7 +9,6 @@ from typing import cast
 
 import numpy as np
 import peptide_campaign
-import peptide_equilibrium
 import peptide_states
 import pytest
 import torch
@@ -78,8 +77,6 @@ def test_halves_of_runs_are_kept_apart(tmp_path: Path, monkeypatch: pytest.Monke
 
 
 def test_weights_learn_states_at_endless_times(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    for name, value in {"_FRAMES": 300, "_POOL": 2048}.items():
-        monkeypatch.setattr(peptide_equilibrium, name, value)
     monkeypatch.setattr(peptide_states, "_RATE", 1e-2)
     some = wide_peptides()[:2]
     monkeypatch.setattr(peptide_states, "wide_peptides", lambda: some)
@@ -89,7 +86,7 @@ def test_weights_learn_states_at_endless_times(tmp_path: Path, monkeypatch: pyte
     monkeypatch.setattr(peptide_states, "parted", lambda some: (list(some), list(some)))
     start = replace(start, domain=replace(start.domain, sequences=("ACE-GLY-NME",)))
     begun = cast(PeptideSlide, start.model)
-    frames = Equilibrium.of(begun, some[0].sequence, seed=1)
+    frames = Equilibrium.of(begun, some[0].sequence, 1, 128)
     assert some[0].name == "ALA"
     chain, rng = frames.chain, np.random.default_rng(0)
     wanted = np.zeros((2, DRAWS, len(chain.stated.slot)), np.uint8)

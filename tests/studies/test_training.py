@@ -388,17 +388,24 @@ def test_steps_are_taught_to_keep_what_is_drawn_at_endless_times(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """By other weights, by which psi of alanine is in its second state more often."""
-    for name, value in {"_FRAMES": 300, "_POOL": 2048, "_HELD": 1, "_RATE": 2e-2}.items():
+    some = wide_peptides()[:2]
+    for name, value in {
+        "_FRAMES": 300,
+        "_HELD": 1,
+        "_RATE": 2e-2,
+        "_WINDOWS": 128,
+        "wide_peptides": lambda: some,
+    }.items():
         monkeypatch.setattr(peptide_equilibrium, name, value)
     shipped = load_weights(weights_path("peptides"))
     begun, other = (cast(PeptideSlide, load_weights(weights_path("peptides")).model) for _ in range(2))
     with torch.no_grad():
-        other.jumps.of_change[0, :, 1, 0, 1] += 1.0
-        other.jumps.of_change[0, :, 1, 1, 0] -= 1.0
+        other.jumps.of_change[0, :, 1, 0, 1] += 1.3
+        other.jumps.of_change[0, :, 1, 1, 0] -= 1.3
     provenance = {"umbrella_states": 5}
     save_weights(source := tmp_path / "other.safetensors", other, shipped.domain, provenance, half=True)
     found = load_weights(teach(shipped.path, tmp_path / "taught.safetensors", 1, 100, source))
-    taught, frames = cast(PeptideSlide, found.model), Equilibrium.of(other, "ACE-ALA-NME", seed=1)
+    taught, frames = cast(PeptideSlide, found.model), Equilibrium.of(other, "ACE-ALA-NME", 1, 800)
     assert found.provenance["umbrella_states"] == 5 and found.provenance["from"]["hash"] == shipped.hash
 
     def of_psi(model: PeptideSlide, time_ps: float) -> tuple[float, float]:

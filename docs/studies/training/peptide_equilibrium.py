@@ -35,8 +35,8 @@ from surrogate.models.weights import load_weights, provenance_of, save_weights
 from surrogate.training.loop import Stage, StageConfig, train_stages
 from systems.prepare.peptide import build_peptide
 
-# Frames of a molecule, and states of which these are chosen: half of them so that rare ones are among them.
-_FRAMES, _POOL, _FIRST = 800, 8192, 64
+# Frames of a molecule, and states for each of which one is chosen, half of them so that rare ones are among them.
+_FRAMES, _POOL, _FIRST = 800, 10, 64
 # Windows of a step of training; the share at endless times, whose probabilities stay.
 _WINDOWS, _ENDLESS_SHARE, _ENDLESS_FRAMES = 256, 0.15, 4
 # What detailed balance counts beside what probabilities were, the square of a logarithm beside a divergence; states in
@@ -58,21 +58,22 @@ class Equilibrium(NamedTuple):
 
     @classmethod
     @torch.no_grad()
-    def of(cls, model: PeptideSlide, sequence: str, seed: int = 0) -> Equilibrium:
+    def of(cls, model: PeptideSlide, sequence: str, seed: int = 0, n_frames: int | None = None) -> Equilibrium:
         scene, generator = build_peptide(sequence), torch.Generator().manual_seed(seed)
         chain = chain_features(scene, model.config)
         built = torch.tensor(scene.positions_nm, dtype=torch.float32)[None]
         found = cls(chain, built, *model.normalised(built, chain), torch.ones(1))
-        for n in (_FIRST, _FRAMES):
+        for n in (_FIRST, n_frames or _FRAMES):
             found = found.later(model, n, generator)
         return found
 
     def later(self, model: PeptideSlide, n: int, generator: torch.Generator) -> Equilibrium:
         """Return `n` frames endless times after any of these, but for those that cannot be mended."""
         chain, counts, stated = self.chain, self.chain.stated.counts, self.chain.stated
-        start = torch.randint(len(self.states), (_POOL,), generator=generator)
-        times = torch.full((_POOL, 1), model.config.forgotten_ps)
-        uniform = torch.rand(_POOL, 1, *counts.shape, generator=generator)
+        pool = _POOL * n
+        start = torch.randint(len(self.states), (pool,), generator=generator)
+        times = torch.full((pool, 1), model.config.forgotten_ps)
+        uniform = torch.rand(pool, 1, *counts.shape, generator=generator)
         given = self.observed[start], self.states[start], chain.places, counts, times, times
         states = model.jumps_of(chain).draw(*given, uniform)
         sought = balanced_starts(states[:, 0, stated.residue, stated.slot]).max(dim=1).values

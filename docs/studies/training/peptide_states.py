@@ -49,6 +49,8 @@ RECORD = Path(__file__).with_name("umbrella_states.npz")
 DRAWS, LEAST_COUNTED = 2048, 100.0
 LEFT_OUT = 8
 _WINDOWS, _TIMES, _RATE, _DROPPED, _VALIDATE_S = 256, 4, 5e-4, 0.2, 30.0
+# Frames of a molecule that endless times are counted from: little of them is left by then.
+_STARTS = 128
 # The share of training that keeps what is drawn of so many molecules known before.
 _KEEPING, _KNOWN = 0.4, 40
 
@@ -175,7 +177,7 @@ def teach(out: Path, start: Weights, steps: int, some: Sequence[Md]) -> Path:
 
     @cache
     def frames_of(sequence: str) -> Equilibrium:
-        return Equilibrium.of(teacher, sequence)
+        return Equilibrium.of(teacher, sequence, n_frames=_STARTS)
 
     def of_record(md: Md, generator: torch.Generator, dropped: float) -> Tensor:
         frames, n = frames_of(md.sequence), _WINDOWS * _TIMES
@@ -234,7 +236,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         teach(a.path, start, a.steps, read())
     else:
         for name, part in zip(("learned", "left out"), parted(read()), strict=True):
-            found = errors(model, ((md, Equilibrium.of(model, md.sequence)) for md in part))
+            found = errors(model, ((md, Equilibrium.of(model, md.sequence, n_frames=_STARTS)) for md in part))
             sys.stdout.write(f"{len(part)} {name}: off by {found['off']:.1f} %, MD's error {found['own']:.1f} %\n")
 
 
