@@ -12,10 +12,12 @@ import peptide_campaign
 import peptide_states
 import pytest
 import torch
+from peptide_campaign import light_umbrella
 from peptide_equilibrium import Equilibrium
 from peptide_list import held_out_peptides, training_peptides, unseen_peptides, wide_peptides
 from peptide_states import DRAWS, Md, drawn, errors, gather, parted, read, shares, teach
 
+from md_reference.forces.umbrella import Umbrella
 from surrogate.models.architecture import weights_path
 from surrogate.models.peptides.layout import chain_features
 from surrogate.models.peptides.model import PeptideSlide
@@ -38,6 +40,30 @@ def test_an_umbrella_is_of_molecules_that_no_run_of_the_first_ones_shows(monkeyp
     assert not {tuple(name.removeprefix("free-").split("-")) for name in left_out} & {
         p.residues for p in training_peptides()
     }
+
+
+@pytest.mark.parametrize(("n_torsions", "left_kt"), [(2, 1.5), (9, 3.0)])
+def test_of_many_torsions_more_of_the_free_energy_is_left(n_torsions: int, left_kt: float) -> None:
+    """So that a fifth of the frames counts, whatever comes together; of few as much is left as is asked for."""
+    rng, kt = np.random.default_rng(0), 8.314462618e-3 * 300.0
+    grid = np.linspace(-np.pi, np.pi, 20_001)
+    likely = np.exp(2.5 * np.cos(2 * grid) + np.cos(grid))
+    angles = rng.choice(grid, (40_000, n_torsions), p=likely / likely.sum())
+    quads = np.arange(4 * n_torsions).reshape(-1, 4)
+
+    def counting(umbrella: Umbrella) -> float:
+        """The share that counts of frames drawn as MD under the potential draws them."""
+        u = umbrella.energies_of(angles) / kt
+        factors = np.exp(rng.choice(u, 100_000, p=np.exp(-u) / np.exp(-u).sum()))
+        return float(factors.sum() ** 2 / len(factors) / (factors**2).sum())
+
+    found, asked = (
+        light_umbrella(quads, angles, [1.5] * n_torsions),
+        Umbrella.of(quads, angles, [1.5] * n_torsions, 300.0),
+    )
+    wanted = Umbrella.of(quads, angles, [left_kt] * n_torsions, 300.0)
+    assert found == wanted and 0.18 < counting(found) < 0.6
+    assert (found == asked) == (counting(asked) > 0.2)
 
 
 def test_states_are_drawn_as_often_as_they_count_and_tests_are_refused(tmp_path: Path) -> None:
