@@ -36,8 +36,8 @@ from surrogate.models.potential import TOLERANCE, Bath
 from systems.files.native import CompilerError, compiled_program
 
 _SOURCE = Path(__file__).with_name("simd.cpp")
-# Copies at once: of a whole register, and where no more are asked for; what arrays are aligned to, bytes. Two registers
-# in the place of one take five to seven times as long.
+# Copies at once: a whole register of them, and where no more are asked for; what arrays are aligned to, bytes. Where a
+# number of each copy takes two registers, compilers keep most of them in memory, and it takes several times as long.
 _WIDTH = {"AVX512": 16, "AVX2": 8}.get(torch.backends.cpu.get_cpu_capability(), 4)
 _FEW, _ALIGNED = 4, 64
 
