@@ -19,7 +19,7 @@ from quick_report import evaluated_at_once
 from surrogate import api
 from surrogate.verbs.options import RunOptions
 from surrogate.verbs.run import one_scene, stages
-from surrogate.verbs.run.decision import decide, least_budget_s
+from surrogate.verbs.run.decision import Decision, decide, least_budget_s
 from surrogate.verbs.run.rates import REPLICAS, Rates, Rolls
 from surrogate.verbs.run.run_record import RunRecord, read_run, write_run
 from surrogate.verbs.run.stages import Site, StageOf
@@ -36,6 +36,8 @@ AT_ONCE = n_replicas() if HAS_COMPILER else 4
 OPENMM, SIMD = RATES, replace(RATES, platform="simd", at_once=AT_ONCE, md_ps_per_s=0.8)
 # As if the molecule were in water, and the water not there.
 WET = replace(SIMD, explicit=True, step_s=1e-4, md_ps_per_s=8.0)
+# Of which lengths are: in so much MD under an umbrella is worth beginning, and not much longer than it must be.
+LENGTHS_OF_S = {WET: 220.0}
 WAYS = [
     pytest.param(("md", OPENMM, ["md", "held-out md", "report"]), id="one replica"),
     pytest.param(("md", SIMD, ["md", "report"]), id="simd", marks=needs_compiler),
@@ -44,6 +46,7 @@ WAYS = [
                  marks=needs_compiler),
 ]  # fmt: skip
 Way = tuple[str, Rates, list[str]]
+Undisturbed = Callable[[Way], tuple[Path, dict[str, Any]]]
 
 
 @pytest.fixture(autouse=True)
@@ -64,6 +67,10 @@ class Killed(BaseException):
 def run(folder: Path, asked: str, *, resume: bool = False, starts: str = "many") -> dict[str, Any]:
     options: dict[str, Any] = {"budget_s": BUDGET_S, "way": asked, "resume": resume, "starts": starts}
     return api.run("alanine-dipeptide", folder, quiet=True, **options)
+
+
+def as_if_measured_at_once(rates: Rates, _: float, *how: Any, **more: Any) -> Decision:
+    return decide(rates, LENGTHS_OF_S.get(rates, BUDGET_S), *how, **more)
 
 
 def frames(folder: Path) -> dict[str, Any]:
@@ -113,17 +120,31 @@ def way(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Way:
     asked, rates, names = request.param
     monkeypatch.setattr(one_scene, "measure", lambda *_: rates)
     # However long it took to get there: lengths of runs are those of the whole budget.
-    monkeypatch.setattr(one_scene, "decide", lambda rates, left_s, *how, **more: decide(rates, BUDGET_S, *how, **more))
+    monkeypatch.setattr(one_scene, "decide", as_if_measured_at_once)
     monkeypatch.setitem(stages.STAGES, "report", replace(stages.STAGES["report"], work=evaluated_at_once))
     return asked, rates, names
 
 
+@pytest.fixture(scope="module")
+def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> Undisturbed:
+    """Return the folder of a run that nothing disturbs, made once a way and read only, and what it returned."""
+    made: dict[str, tuple[Path, dict[str, Any]]] = {}
+
+    def of(way: Way) -> tuple[Path, dict[str, Any]]:
+        if (key := str(way)) not in made:
+            folder = tmp_path_factory.mktemp("whole")
+            made[key] = folder, run(folder, way[0])
+        return made[key]
+
+    return of
+
+
 def test_kills_before_and_after_each_stage_change_nothing(
-    way: Way, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    way: Way, undisturbed: Undisturbed, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     asked, rates, names = way
-    whole, killed = tmp_path / "whole", tmp_path / "killed"
-    expected = run(whole, asked)
+    killed = tmp_path / "killed"
+    whole, expected = undisturbed(way)
     assert ended(expected) == [(name, "done") for name in names]
     begun: dict[str, str] = {}
     for k, name in enumerate(names):
@@ -137,11 +158,11 @@ def test_kills_before_and_after_each_stage_change_nothing(
     found = run(killed, asked, resume=True)
     assert ended(found) == ended(expected) and found["outcome"] == expected["outcome"]
     assert run_ids(killed) == begun, "nothing was made twice"
-    kept, undisturbed = frames(killed), frames(whole)
+    kept, right = frames(killed), frames(whole)
     beside = {OPENMM: 1, SIMD: 0, WET: 2 * rates.replicas}[rates]
     assert len(kept) == {"md": rates.replicas, "surrogate": REPLICAS}[asked] + beside
-    assert kept.keys() == undisturbed.keys()
-    for name, positions in undisturbed.items():
+    assert kept.keys() == right.keys()
+    for name, positions in right.items():
         assert np.array_equal(kept[name], positions), name
 
 
@@ -150,7 +171,7 @@ def test_md_under_an_umbrella_gives_the_answer_and_the_starts_of_held_out_md(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(one_scene, "measure", lambda *_: WET)
-    monkeypatch.setattr(one_scene, "decide", lambda rates, left_s, *how, **more: decide(rates, BUDGET_S, *how, **more))
+    monkeypatch.setattr(one_scene, "decide", as_if_measured_at_once)
     monkeypatch.setitem(stages.STAGES, "report", replace(stages.STAGES["report"], work=evaluated_at_once))
     folder, begun = tmp_path / "a", []
     simulated = replicas.simulate_batch
@@ -220,7 +241,7 @@ def ended_by_the_clock(stage: Callable[[], Any]) -> Any:
 @needs_compiler
 def test_md_begins_at_frames_of_the_rollout_and_does_so_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(one_scene, "measure", lambda *_: SIMD)
-    monkeypatch.setattr(one_scene, "decide", lambda rates, left_s, *how, **more: decide(rates, BUDGET_S, *how, **more))
+    monkeypatch.setattr(one_scene, "decide", as_if_measured_at_once)
     monkeypatch.setitem(stages.STAGES, "report", replace(stages.STAGES["report"], work=evaluated_at_once))
     one, two = tmp_path / "one", tmp_path / "two"
     run(one, "surrogate")
@@ -349,9 +370,11 @@ def test_measuring_that_takes_the_budget_leaves_the_stages_the_least(monkeypatch
     assert 19.0 < sum(stage.seconds for stage in late.decision.stages) <= least_budget_s(OPENMM)
 
 
-def test_ctrl_c_in_each_stage_keeps_everything(way: Way, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_ctrl_c_in_each_stage_keeps_everything(
+    way: Way, undisturbed: Undisturbed, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     asked, _, names = way
-    expected = run(tmp_path / "whole", asked)
+    _, expected = undisturbed(way)
     for k, name in enumerate(names):
         with monkeypatch.context() as patch:
             patch.setitem(stages.STAGES, name, disturbed(stages.STAGES[name], before=interrupt))
