@@ -201,8 +201,10 @@ def test_markdown_goes_beside_the_page(folder: Path) -> None:
 def test_every_type_of_chart_is_drawn_and_written(comparison: Comparison) -> None:
     charts = one_of_each_type()
     first = comparison.evaluations[0]
-    plain = {a.title: a for a in albums(first.charts, 300.0)}
-    drawn = {a.title: a for a in albums((*charts, *first.charts), 300.0)}
+    # Of the comparison's own what stands beside one of them: drawing all takes seconds.
+    beside = [c for c in first.charts if c.section in {c.section for c in charts}]
+    plain = {a.title: a for a in albums(beside, 300.0)}
+    drawn = {a.title: a for a in albums((*charts, *beside), 300.0)}
     section = "Equivalent MD time"
     assert len(drawn[section].figures) == len(plain.get(section, Album("", [], "")).figures) + 1
     assert len(drawn["Kinetics"].figures) == len(plain["Kinetics"].figures)
@@ -226,12 +228,12 @@ def test_only_html_is_written(comparison: Comparison, tmp_path: Path) -> None:
     assert not list(tmp_path.iterdir())
 
 
-def test_nothing_is_left_where_it_cannot_be_written(comparison: Comparison, tmp_path: Path) -> None:
+def test_nothing_is_left_where_it_cannot_be_written(few_pictures: Comparison, tmp_path: Path) -> None:
     with pytest.raises(StorageError, match=r"absent|taken"):
-        write_report(comparison, tmp_path / "absent" / "report.html")
+        write_report(few_pictures, tmp_path / "absent" / "report.html")
     (tmp_path / "taken.html").mkdir()
     with pytest.raises(StorageError, match=r"absent|taken"):
-        write_report(comparison, tmp_path / "taken.html")
+        write_report(few_pictures, tmp_path / "taken.html")
     assert sorted(p.name for p in tmp_path.iterdir()) == ["taken.html"]
 
 
@@ -311,8 +313,8 @@ def test_long_names_beside_bars_leave_room_for_the_bars() -> None:
     assert seen[2] < 0 or seen[3] < 0.4, "negative control: whole names do not fit"
 
 
-def test_a_comparison_draws_reference_replicate_and_candidates(inputs: tuple[Ensemble, Ensemble, Ensemble]) -> None:
-    reference, other, rolled = inputs
+def test_a_comparison_draws_reference_replicate_and_candidates(simulate: Callable[..., Ensemble]) -> None:
+    reference, other, rolled = (simulate(seed, 3_000) for seed in (1, 2, 3))
     found = compare(reference, [rolled, other], other)
     axes = found.plot().axes
     titles = [a.get_title() for a in axes if a.get_title()]
