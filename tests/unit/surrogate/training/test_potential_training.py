@@ -155,7 +155,7 @@ def test_where_members_differ_is_where_the_model_knows_least(tmp_path: Path) -> 
     learner = Learner(PainetPotential(SMALL), reference, QUICK, tmp_path / "w.safetensors", resume=False)
     optimiser = torch.optim.Adam(learner.model.parameters(), 5e-3)
     generator = torch.Generator().manual_seed(0)
-    for _ in range(300):
+    for _ in range(200):
         loss, _ = learner.loss(generator)
         optimiser.zero_grad()
         loss.backward()
