@@ -81,12 +81,15 @@ def _check(file: h5py.File, path: Path) -> None:
     import h5py
 
     size = os.stat(path).st_size
-    links: list[tuple[str, Any]] = []
-    file.visititems_links(lambda name, link: links.append((name, link)))
-    for name, link in links:
-        if isinstance(link, h5py.ExternalLink):
-            raise TrajectoryError(f"{path}: /{name} is a link into another file ({link.filename}); copy the data in.")
-        found = file.get(name) if isinstance(link, h5py.HardLink) else None
+    links: list[tuple[bytes, int]] = []
+    # As h5py's visititems_links, which looks each name up three times.
+    file.id.links.visit(lambda name, of: links.append((name, of.type)), info=True)
+    for link, kind in links:
+        name = link.decode(errors="replace")
+        if kind == h5py.h5l.TYPE_EXTERNAL:
+            other = file.get(link, getlink=True).filename
+            raise TrajectoryError(f"{path}: /{name} is a link into another file ({other}); copy the data in.")
+        found = file.get(link) if kind == h5py.h5l.TYPE_HARD else None
         if not isinstance(found, h5py.Dataset) or not found.size:
             continue
         if found.external or found.is_virtual:
