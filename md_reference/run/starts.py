@@ -35,6 +35,9 @@ _COOLING = 0.2
 # By OpenMM, one after the other: so far apart, of that time.
 _APART = 0.2
 _TURNED_PS, _LEAST_TURNED, _STIFFNESS_KJ_MOL = 20.0, 0.2, 300.0
+# Steps of minimisation before MD: to the very minimum a box of water takes three to five times as long, and MD then
+# begins too cold.
+_MINIMISED = 200
 _PIECE = 500
 # A scene for each replica, and how they were found, in a few words.
 Starts = tuple[tuple[Scene, ...], str]
@@ -184,7 +187,7 @@ def _by_openmm(
             engine.thermalise()
             engine.step(max(1, round(_APART * hot_ps / hot.timestep_ps)))
             kept[own] = engine.positions()
-            engine.minimise(max_iterations=200)
+            engine.minimise(max_iterations=_MINIMISED)
             yield engine.positions()[None]
 
 
@@ -199,7 +202,7 @@ def _in_water(wet: Scene, conditions: Conditions, dry: Scene, frames: FloatArray
     quads: IntArray = np.asarray(solute)[rotatable_torsions(dry)]
     system = build_system(wet, conditions.force)
     with Engine(wet, replace(conditions, platform="CPU", ensemble="nvt"), threads=1, system=system) as engine:
-        engine.minimise()
+        engine.minimise(max_iterations=_MINIMISED)
         start = engine.positions()
     out = np.empty((len(angles), wet.n_atoms, 3))
     for first in range(0, len(angles), n_replicas()):

@@ -12,9 +12,10 @@ from __future__ import annotations
 import copy
 import math
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from itertools import pairwise
 from typing import Literal, NamedTuple
 
@@ -29,6 +30,8 @@ _N_DRAWS, _FLAT_DRAWS = 50, 20
 # enough for a draw, and after most steps: what hardly weighs anything is found last; longest jumps, in steps and in log
 # populations.
 _STEP_TOLERANCE, _SETTLED, _MOST_STEPS, _FURTHEST, _LONGEST_JUMP = 1e-9, 1e-9, 5_000, 1e6, 20.0
+# Numbers in the matrices that are searched for together: more no longer fit into a processor's own memory.
+_AT_ONCE = 32_768
 _LAGS = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000, 5000)
 # A lag leaves each replica four pairs that do not overlap.
 _LAGS_A_REPLICA = 4
@@ -49,6 +52,8 @@ _LEAST_CROSSINGS, _RARE = 5, 0.05
 # What has fewer frames than this share is not named as missing.
 _NAMED_SHARE = 0.005
 
+# Transition matrix, stationary distribution, and the states that they are of.
+_Fitted = tuple[FloatArray, FloatArray, IntArray]
 Fate = Literal["only begun in", "entered and never left", "begun in and not always left", "left and never entered"]
 
 
@@ -165,13 +170,13 @@ def equilibrium(micro: Sequence[IntArray], *, lag: int | None = None, seed: int 
     times = _drawn_times(model, resampled)
     averages = _Averages(model, micro, units)
 
-    def found_by(multiplicity: FloatArray, averages: _Averages, settled: float = _SETTLED) -> FloatArray:
-        counts = averages.beside(np.tensordot(multiplicity, model.by_unit, 1), multiplicity)
-        fitted = _fit(counts, settled)
-        return model.populations if fitted is None else np.asarray(np.bincount(fitted[2], fitted[1], n_micro), float)
+    def found_by(of: Sequence[tuple[FloatArray, _Averages]], settled: float = _SETTLED) -> FloatArray:
+        counts = [beside.beside(np.tensordot(m, model.by_unit, 1), m) for m, beside in of]
+        fits = [_populations(fitted, n_micro) for fitted in _fits(counts, settled)]
+        return np.array([model.populations if p is None else p for p in fits])
 
-    populations = found_by(np.ones(len(units)), averages, 0.0)
-    draws = np.array([found_by(m, averages.shifted(rng)) for m in resampled])
+    populations = found_by([(np.ones(len(units)), averages)], 0.0)[0]
+    draws = found_by([(m, averages.shifted(rng)) for m in resampled])
     rare, seen = _rare(model, micro, populations)
     for of in rare:
         draws[:, of.microstates] *= np.exp(math.sqrt(2.0 / of.crossings) * rng.normal(size=(len(draws), 1)))
@@ -242,17 +247,13 @@ def with_prior(
     multiplicity = np.hstack([found.resampled, drawn])
     n_md = len(of_md)
 
-    def populations(each: FloatArray, settled: float = _SETTLED) -> FloatArray | None:
+    def counts(each: FloatArray) -> FloatArray:
         md, rolled = (np.tensordot(each[part], by_unit[part], 1) for part in (slice(n_md), slice(n_md, None)))
-        fitted = _fit(_ended(md) + rolled, settled)
-        if fitted is None:
-            return None
-        out = np.zeros(n)
-        out[fitted[2]] = fitted[1]
-        return out
+        return _ended(md) + rolled
 
-    all_units = populations(np.r_[np.ones(len(of_md)), np.full(len(of_prior), scale)], 0.0)
-    draws = [(m, p) for m, p in ((m, populations(m)) for m in multiplicity) if p is not None]
+    all_units = _populations(_fit(counts(np.r_[np.ones(n_md), np.full(len(of_prior), scale)])), n)
+    fits = [_populations(fitted, n) for fitted in _fits([counts(m) for m in multiplicity], _SETTLED)]
+    draws = [(m, p) for m, p in zip(multiplicity, fits, strict=True) if p is not None]
     if all_units is None or not draws:
         raise InputError("no reversible Markov model fits the transitions of MD and of the rollout.")
     visits = [sum(np.bincount(m[m >= 0], minlength=n) for m in of) for of in (micro, prior)]
@@ -322,69 +323,105 @@ def _components(counts: FloatArray) -> IntArray:
     """Return for each state which strongly connected set it is in; 0 is the one with most counts."""
     if (counts > 0).all():
         return np.zeros(len(counts), dtype=np.int64)
-    from scipy.sparse import csr_array
-    from scipy.sparse.csgraph import connected_components
-
-    n, labels = connected_components(csr_array(counts > 0), directed=True, connection="strong")
+    n, labels = _connected((counts > 0).tobytes(), len(counts))
     weight = np.bincount(labels, weights=counts.sum(0) + counts.sum(1), minlength=n)
     rank = np.empty(n, dtype=np.int64)
     rank[np.argsort(-weight, kind="stable")] = np.arange(n)
     return np.asarray(rank[labels])
 
 
-def _fit(counts: FloatArray, settled: float = 0.0) -> tuple[FloatArray, FloatArray, IntArray] | None:
+@lru_cache(64)  # draws of the same replicas mostly have the same transitions
+def _connected(edges: bytes, n: int) -> tuple[int, IntArray]:
+    """Return how many strongly connected sets there are, and in which each state is, of `(n, n)` flags."""
+    from scipy.sparse import csr_array
+    from scipy.sparse.csgraph import connected_components
+
+    graph = csr_array(np.frombuffer(edges, dtype=np.bool_).reshape(n, n))
+    found, labels = connected_components(graph, directed=True, connection="strong")
+    return int(found), labels
+
+
+def _fit(counts: FloatArray) -> _Fitted | None:
     """Return transition matrix and stationary distribution of the largest connected set, and its states; None where
     there is none, or the estimate does not converge."""
-    kept = np.flatnonzero((_components(counts) == 0) & (counts.sum(0) + counts.sum(1) > 0))
-    if not len(kept):
-        return None
-    if len(kept) == 1:
-        return np.ones((1, 1)), np.ones(1), kept
-    found = reversible(counts[np.ix_(kept, kept)], settled)
-    return None if found is None else (*found, kept)
+    return _fits([counts])[0]
 
 
-def reversible(counts: FloatArray, settled: float = 0.0) -> tuple[FloatArray, FloatArray] | None:
-    """Return the reversible transition matrix `(n, n)` of greatest likelihood, and its stationary distribution `(n,)`,
-    of counts that connect all states both ways, or one whose populations change by less than `settled` in a step of its
-    search; None where it is not found.
+def _fits(counts: Sequence[FloatArray], settled: float = 0.0) -> list[_Fitted | None]:
+    """Return the same of many counts `(n, n)`: those of the same connected set are searched for together."""
+    found: list[_Fitted | None] = [None] * len(counts)
+    alike: dict[tuple[int, ...], list[int]] = {}
+    for i, c in enumerate(counts):
+        inside = np.flatnonzero((_components(c) == 0) & (c.sum(0) + c.sum(1) > 0))
+        alike.setdefault(tuple(inside.tolist()), []).append(i)
+    for states, members in alike.items():
+        kept = np.array(states, dtype=np.int64)
+        if len(kept) == 1:
+            for i in members:
+                found[i] = np.ones((1, 1)), np.ones(1), kept
+        elif len(kept):
+            at_once = max(1, _AT_ONCE // len(kept) ** 2)
+            for some in (members[k : k + at_once] for k in range(0, len(members), at_once)):
+                each = reversible(np.array([counts[i][np.ix_(kept, kept)] for i in some]), settled)
+                for i, of in zip(some, each, strict=True):
+                    found[i] = None if of is None else (*of, kept)
+    return found
+
+
+def _populations(fitted: _Fitted | None, n: int) -> FloatArray | None:
+    """Return populations `(n,)` of all states by a fit, None where there is none."""
+    return None if fitted is None else np.asarray(np.bincount(fitted[2], fitted[1], n), float)
+
+
+def reversible(counts: FloatArray, settled: float = 0.0) -> list[tuple[FloatArray, FloatArray] | None]:
+    """Return for each of some counts `(k, n, n)` that connect all states both ways the reversible transition matrix
+    `(n, n)` of greatest likelihood, and its stationary distribution `(n,)`, or one whose populations change by less
+    than `settled` in a step of its search; None where it is not found.
 
     The flux is x_ij = (c_ij + c_ji) / (c_i / x_i + c_j / x_j) with x_i its sum over j (Prinz et al., equation 30), here
     by fixed-point iteration in log x, sped up by squared extrapolation (Varadhan and Roland, Scand. J. Stat. 35, 335
     (2008)): plain iteration, deeptime's, takes many more steps where states are hardly connected.
     """
-    both, out = counts + counts.T, counts.sum(1)
+    both, out = counts + counts.transpose(0, 2, 1), counts.sum(2)
+    with np.errstate(all="ignore"):  # a jump too far gives no numbers
+        y = _fixed_point(both, out, np.log(both.sum(2) / both.sum((1, 2))[:, None]), settled)
+        w = out * np.exp(-y)
+        flux = both / (w[:, :, None] + w[:, None])
+        total = flux.sum(2)
+        matrix, stationary = flux / total[:, :, None], total / total.sum(1)[:, None]
+    return [None if np.isnan(of[0]) else (m, s) for of, m, s in zip(y, matrix, stationary, strict=True)]
+
+
+def _fixed_point(both: FloatArray, out: FloatArray, y: FloatArray, settled: float) -> FloatArray:
+    """Return log populations `(k, n)` that a step no longer changes, searched for from `y`; NaN where they are not
+    found."""
 
     def step(y: FloatArray) -> FloatArray:
         w = out * np.exp(-y)
-        z = np.add.reduce(both / (w[:, None] + w), 1)
-        return np.asarray(np.log(z / np.add.reduce(z)))
+        z = np.add.reduce(both / (w[:, :, None] + w[:, None]), 2)
+        return np.asarray(np.log(z / np.add.reduce(z, 1)[:, None]))
 
-    with np.errstate(all="ignore"):  # a jump too far gives no numbers
-        y = _fixed_point(step, np.log(both.sum(1) / both.sum()), settled)
-    if y is None:
-        return None
-    w = out * np.exp(-y)
-    flux = both / (w[:, None] + w[None])
-    total = flux.sum(1)
-    return flux / total[:, None], total / total.sum()
-
-
-def _fixed_point(step: Callable[[FloatArray], FloatArray], y: FloatArray, settled: float) -> FloatArray | None:
-    """Return log populations that a step no longer changes, searched for from `y`; None where they are not found."""
+    found, left = np.full_like(y, np.nan), np.arange(len(y))
     for _ in range(_MOST_STEPS):
         first = step(y)
         second = step(first)
         r, v = first - y, second - 2.0 * first + y
         off = np.abs(r)
-        if float(off.max()) < _STEP_TOLERANCE or float((np.exp(y) * off).max()) < settled:
-            return y
-        ratio = math.sqrt(float(r @ r)) / max(math.sqrt(float(v @ v)), 1e-300)
-        further = min(max(1.0, ratio), _FURTHEST)
+        moved = (np.exp(y) * off).max(1)
+        done = (off.max(1) < _STEP_TOLERANCE) | (moved < settled)
+        if done.any():
+            found[left[done]] = y[done]
+            if done.all():
+                return found
+            left, both, out, y, second, r, v, moved = (a[~done] for a in (left, both, out, y, second, r, v, moved))
+        ratio = np.sqrt((r * r).sum(1)) / np.maximum(np.sqrt((v * v).sum(1)), 1e-300)
+        further = np.minimum(np.fmax(1.0, ratio), _FURTHEST)[:, None]
         jumped = step(y + 2.0 * further * r + further**2 * v)
         # A jump too far is none.
-        y = jumped if float(np.abs(jumped - second).max()) < _LONGEST_JUMP else second
-    return y if float((np.exp(y) * off).max()) < 10.0 * _SETTLED else None
+        y = np.where(np.abs(jumped - second).max(1, keepdims=True) < _LONGEST_JUMP, jumped, second)
+    near = moved < 10.0 * _SETTLED
+    found[left[near]] = y[near]
+    return found
 
 
 def _timescales(matrix: FloatArray, stationary: FloatArray, lag: int) -> tuple[FloatArray, FloatArray]:
@@ -459,8 +496,9 @@ def _rare(model: _Model, micro: list[IntArray], populations: FloatArray) -> tupl
 def _drawn_times(model: _Model, resampled: IntArray) -> FloatArray:
     """Return timescales `(n_draws, k)` of resampled replicas."""
     times = np.full((len(resampled), len(model.times)), np.nan)
-    for row, multiplicity in zip(times, resampled, strict=True):
-        if (fitted := _fit(np.tensordot(multiplicity, model.by_unit, 1), _SETTLED)) is not None:
+    fits = _fits([np.tensordot(multiplicity, model.by_unit, 1) for multiplicity in resampled], _SETTLED)
+    for row, fitted in zip(times, fits, strict=True):
+        if fitted is not None:
             own = _timescales(fitted[0], fitted[1], model.lag)[0][: len(row)]
             row[: len(own)] = own
     return times

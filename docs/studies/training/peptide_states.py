@@ -9,7 +9,7 @@ CAMPAIGN is a folder of `peptide_campaign --umbrella --solvent obc2`. `record` a
 at equilibrium. Nothing else is kept of this MD, and the campaign leaves out what the record holds. `teach` trains the
 probabilities at endless times on it, but those of the signs of phi; of molecules that WEIGHTS were trained on they are
 to stay what they were. One molecule in eight is left out. `compare` says how far populations at endless times are from
-those of MD, of molecules learned and left out. Weights so taught are for endless times alone: `peptide_equilibrium`
+those of MD, of molecules left out and learned. Weights so taught are for endless times alone: `peptide_equilibrium`
 teaches steps to keep what they draw.
 """
 
@@ -65,6 +65,10 @@ class Md(NamedTuple):
     @property
     def sequence(self) -> str:
         return self.name.removeprefix("free-") if self.name.startswith("free-") else f"ACE-{self.name}-NME"
+
+    @property
+    def is_pair(self) -> bool:
+        return self.name.removeprefix("free-").count("-") == 1
 
     def laid(self, chain: ChainFeatures) -> Tensor:
         """Return the states `(n, n_residues, MOST_TORSIONS)`."""
@@ -235,9 +239,14 @@ def main(arguments: Sequence[str] | None = None) -> None:
     elif a.what == "teach":
         teach(a.path, start, a.steps, read())
     else:
-        for name, part in zip(("learned", "left out"), parted(read()), strict=True):
-            found = errors(model, ((md, Equilibrium.of(model, md.sequence, n_frames=_STARTS)) for md in part))
-            sys.stdout.write(f"{len(part)} {name}: off by {found['off']:.1f} %, MD's error {found['own']:.1f} %\n")
+        for name, part in zip(("left out", "learned"), reversed(parted(read())), strict=True):
+            for kind, is_pair in (("pairs", True), ("longer", False)):
+                if not (some := [md for md in part if md.is_pair == is_pair]):
+                    continue
+                found = errors(model, ((md, Equilibrium.of(model, md.sequence, n_frames=_STARTS)) for md in some))
+                off, own = found["off"], found["own"]
+                sys.stdout.write(f"{len(some)} {kind} {name}: off by {off:.1f} %, MD's error {own:.1f} %\n")
+                sys.stdout.flush()
 
 
 if __name__ == "__main__":

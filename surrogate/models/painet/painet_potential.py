@@ -88,6 +88,14 @@ class PainetPotential(Potential):
         self._made = molecule, simd or gradient_of(lambda x: self.members(x, topology, made))
         return self._made[1]
 
+    def exact_gradient(self, positions_nm: Tensor, molecule: Molecule) -> GradientFn:
+        if molecule.n_atoms > FEW_ATOMS:
+            return super().exact_gradient(positions_nm, molecule)
+        topology = self.topology(molecule)
+        with torch.inference_mode(False), torch.no_grad():
+            made = self.network.prepare(topology, positions_nm)
+        return gradient_of(lambda x: self.members(x, topology, made))
+
     def langevin(self, x: Tensor, v: Tensor, molecule: Molecule, masses: Tensor, thermal: Tensor, draw: Tensor, *,
                  timestep_ps: float | None = None) -> tuple[Tensor, Tensor]:  # fmt: skip
         """See `Potential.langevin`; all steps by SIMD where that runs."""

@@ -110,14 +110,6 @@ def test_in_water_little_time_is_for_turning_where_little_is_for_being_hot(monke
     assert asked == [4.0, 10.0]
 
 
-@pytest.fixture
-def hardly_minimised(monkeypatch: pytest.MonkeyPatch) -> None:
-    """In water MD begins as well after some steps down; to the very minimum it is a quarter of a minute."""
-    minimise = starts.Engine.minimise
-    monkeypatch.setattr(starts.Engine, "minimise", lambda engine, **_: minimise(engine, max_iterations=100))
-
-
-@pytest.mark.usefixtures("hardly_minimised")
 def test_at_constant_pressure_and_without_a_solute(monkeypatch: pytest.MonkeyPatch) -> None:
     wet = solvate(SCENE, spec := ForceFieldSpec("ff14SB", "tip3p"), WaterBox())
     npt = Conditions(spec, seed=3, ensemble="npt")
@@ -127,7 +119,6 @@ def test_at_constant_pressure_and_without_a_solute(monkeypatch: pytest.MonkeyPat
     assert "nothing but water" in many_starts(water, npt, 2)[1]
 
 
-@pytest.mark.usefixtures("hardly_minimised")
 def test_frames_of_a_solute_are_set_in_its_water() -> None:
     wet = solvate(SCENE, spec := ForceFieldSpec("ff14SB", "tip3p"), WaterBox())
     frames = np.stack([scene.positions_nm for scene in many_starts(SCENE, conditions(), 3)[0]])

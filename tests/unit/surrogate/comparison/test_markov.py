@@ -1,5 +1,9 @@
 from __future__ import annotations
 
+import itertools
+from collections.abc import Sequence
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -231,13 +235,12 @@ def test_what_fits_nothing_is_left_out(
     every: int, monkeypatch: pytest.MonkeyPatch, recwarn: pytest.WarningsRecorder
 ) -> None:
     """Lags or resampled replicas of which no matrix is found: by others the answer stands, by none it is a line."""
-    calls, fit = [0], markov._fit
+    calls, fits = itertools.count(1), markov._fits
 
-    def sometimes(counts: np.ndarray, settled: float = 0.0) -> object:
-        calls[0] += 1
-        return None if calls[0] % every == 0 else fit(counts)
+    def sometimes(counts: Sequence[np.ndarray], settled: float = 0.0) -> list[Any]:
+        return [None if next(calls) % every == 0 else found for found in fits(counts)]
 
-    monkeypatch.setattr(markov, "_fit", sometimes)
+    monkeypatch.setattr(markov, "_fits", sometimes)
     micro = run(chain(), [0, 1, 2, 2] * 8, 300)
     if every == 1:
         with pytest.raises(InputError, match="no reversible Markov model fits"):
@@ -268,7 +271,7 @@ def test_the_likeliest_reversible_matrix_is_deeptime_s(coupling: float) -> None:
     counts = rng.integers(5, 200, (12, 12)).astype(float)
     counts[:6, 6:] = counts[6:, :6] = 0.0
     counts[2, 7], counts[7, 2] = np.ceil(3.0 * coupling), np.ceil(40.0 * coupling)
-    found = reversible(counts)
+    (found,) = reversible(counts[None])
     assert found is not None
     matrix, stationary = found
     right = MaximumLikelihoodMSM(reversible=True, maxiter=1_000_000, maxerr=1e-13).fit(counts).fetch_model()

@@ -303,12 +303,12 @@ def test_what_a_rollout_saw_once_does_not_make_all_of_it_count() -> None:
 def test_a_draw_that_is_not_found_is_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
     """As a draw without populations it would be an error of a third of every share."""
     md, of_rollout = (list(jumps(SLOW, [0, 1, 2, 1] * 4, n, 2)) for n in (400, 2000))
-    alone, fit, calls = equilibrium(md), markov._fit, iter(range(1000))
-    monkeypatch.setattr(markov, "_fit", lambda *a: None if next(calls) % 5 == 4 else fit(*a))
+    alone, fits, calls = equilibrium(md), markov._fits, iter(range(1000))
+    monkeypatch.setattr(markov, "_fits", lambda *a: [None if next(calls) % 5 == 4 else found for found in fits(*a)])
     found = with_prior(alone, md, of_rollout, crossings=12.5)
     assert len(found.draws) == len(found.resampled) == 40
     assert found.draws.sum(1) == pytest.approx(1.0)
-    monkeypatch.setattr(markov, "_fit", lambda *_: None)
+    monkeypatch.setattr(markov, "_fits", lambda counts, *_: [None] * len(counts))
     with pytest.raises(InputError, match="no reversible Markov model"):
         with_prior(alone, md, of_rollout, crossings=12.5)
 
