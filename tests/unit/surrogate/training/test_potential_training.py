@@ -73,10 +73,17 @@ class Springs:
         return Answers(x, energies, forces)
 
 
-def test_it_learns_forces_and_asks_about_more_states(tmp_path: Path) -> None:
-    reference, out = Springs(), tmp_path / "w.safetensors"
+@pytest.fixture(scope="module")
+def learned(tmp_path_factory: pytest.TempPathFactory) -> tuple[Springs, Path]:
+    """A reference that was asked, and the weights that learned from it."""
+    reference, out = Springs(), tmp_path_factory.mktemp("learned") / "w.safetensors"
     config = replace(QUICK, steps=100, learning_rate=5e-3, matrix_rate=0.05)
     learn_potential(reference, out, SMALL, config)
+    return reference, out
+
+
+def test_it_learns_forces_and_asks_about_more_states(learned: tuple[Springs, Path]) -> None:
+    reference, out = learned
     weights = load_weights(out)
     found = weights.provenance
     assert found["force_rms"] < 0.4 * found["mean_force"]
@@ -96,9 +103,8 @@ def test_it_learns_forces_and_asks_about_more_states(tmp_path: Path) -> None:
     assert ((lengths - reference.pairs[0][2]).abs() < 0.05).all()
 
 
-def test_it_begins_with_what_other_weights_know(tmp_path: Path) -> None:
-    known = tmp_path / "known.safetensors"
-    learn_potential(Springs(), known, SMALL, replace(QUICK, steps=100, learning_rate=5e-3, matrix_rate=0.05))
+def test_it_begins_with_what_other_weights_know(learned: tuple[Springs, Path], tmp_path: Path) -> None:
+    _, known = learned
     few = replace(QUICK, steps=2, learning_rate=1e-5, matrix_rate=1e-5)
     found, wide = {}, load_weights(known)
     walls = wide.model.network.nearest_nm.mul_(0.5).clone()
