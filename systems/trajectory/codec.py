@@ -114,9 +114,9 @@ def open_trajectory(path: str | Path, *, top: str | Path | None = None) -> Traje
 
     path, top = Path(path), None if top is None else Path(top)
     suffix = path.suffix.lower()
-    if suffix in _HDF5 and not hdf5_file.is_plain_h5md(path):
-        return hdf5_file.Hdf5Reader(path, top)
-    if suffix in (*_HDF5, ".h5md"):
+    if suffix in _HDF5:
+        return hdf5_file.open_by_layout(path, top)
+    if suffix == ".h5md":
         return hdf5_file.H5mdReader(path, top)
     if suffix == ".dcd":
         return dcd_file.DcdReader(path, top)

@@ -127,9 +127,9 @@ class Hdf5Reader(TrajectoryReader):
     # Of its unit of length.
     _nm = 1.0
 
-    def __init__(self, path: Path, top: Path | None = None) -> None:
+    def __init__(self, path: Path, top: Path | None = None, file: h5py.File | None = None) -> None:
         super().__init__(path)
-        self._file = open_hdf5(path)
+        self._file = open_hdf5(path) if file is None else file
         try:
             with damage_reported(path):
                 self._read_headers(top)
@@ -255,13 +255,16 @@ class H5mdReader(Hdf5Reader):
             return nm * values if values.any() else None
 
 
-def is_plain_h5md(path: Path) -> bool:
-    """Whether this is another program's H5MD, without MDTraj's names beside it."""
+def open_by_layout(path: Path, top: Path | None = None) -> Hdf5Reader:
+    """Open another program's H5MD, without MDTraj's names beside it, or else ours and MDTraj's. Raises what they do."""
+    file = open_hdf5(path)
     try:
-        with open_hdf5(path) as file:
-            return "h5md" in file and "coordinates" not in file and "surromd" not in file
-    except TrajectoryError:  # its own reader says how it is damaged
-        return False
+        with damage_reported(path):
+            is_h5md = "h5md" in file and "coordinates" not in file and "surromd" not in file
+    except BaseException:
+        file.close()
+        raise
+    return (H5mdReader if is_h5md else Hdf5Reader)(path, top, file)
 
 
 def _topology_json(scene: Scene) -> str:
