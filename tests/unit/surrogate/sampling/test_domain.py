@@ -137,7 +137,7 @@ def test_weights_of_another_force_field_are_no_choice_where_one_is_asked_for() -
     quantum, classical = {"force_field": "gfn2-xtb", "solvent": "vacuum"}, {"force_field": "ff14SB", "solvent": "obc2"}
     assert choose_weights(paracetamol, conditions=quantum)[0].path.stem == "paracetamol-gfn2-xtb"
     assert choose_weights(peptide, conditions=classical)[0].path.stem == "peptides"
-    drug = prepare("smiles:CCOc1ccccc1")
+    drug = prepare("smiles:CCO")
     assert choose_weights(drug, conditions=quantum)[0].path.stem == "drug-like-gfn2-xtb"
     with pytest.raises(
         OutOfDomainError, match="The nearest: drug-like-gfn2-xtb, where its level is asked for: `level='gfn2"
