@@ -232,7 +232,7 @@ def test_batches_show_crossings_of_phi_apart_from_what_is_likely(monkeypatch: py
 
 def test_a_training_learns_and_its_weights_roll_at_any_lag(tmp_path: Path, frames: TrainingFrames) -> None:
     seen: list[dict[str, float]] = []
-    training = PeptideTraining(steps=300, batch=32, learning_rate=3e-3, validate_every_s=1e9)
+    training = PeptideTraining(steps=200, batch=32, learning_rate=3e-3, validate_every_s=1e9)
     out = train_peptides(
         [frames], tmp_path / "w.safetensors", replace(SMALL, conditioning_noise=0.0), training,
         progress=lambda stage, share, metrics: seen.append(metrics) if metrics else None,
@@ -346,7 +346,7 @@ def test_a_flow_is_taught_to_end_in_two_evaluations_where_it_ended_in_six(
 ) -> None:
     """Nearer than its own two steps come, with the same probabilities of states; the weights say how many steps they
     take."""
-    training = PeptideTraining(steps=150, batch=32, learning_rate=3e-3, validate_every_s=1e9)
+    training = PeptideTraining(steps=100, batch=32, learning_rate=3e-3, validate_every_s=1e9)
     start = train_peptides([frames], tmp_path / "a.safetensors", SMALL, training)
     labeller = load_weights(start)
     apart = {}
