@@ -64,8 +64,10 @@ class Killed(BaseException):
     """Nobody catches it: what is on disk is what a kill leaves."""
 
 
-def run(folder: Path, asked: str, *, resume: bool = False, starts: str = "many") -> dict[str, Any]:
-    options: dict[str, Any] = {"budget_s": BUDGET_S, "way": asked, "resume": resume, "starts": starts}
+def run(
+    folder: Path, asked: str, *, resume: bool = False, starts: str = "many", budget_s: float = BUDGET_S
+) -> dict[str, Any]:
+    options: dict[str, Any] = {"budget_s": budget_s, "way": asked, "resume": resume, "starts": starts}
     return api.run("alanine-dipeptide", folder, quiet=True, **options)
 
 
@@ -273,7 +275,7 @@ def test_where_simd_blow_up_openmm_goes_on_and_nothing_is_lost(
     monkeypatch.setattr(SimdReplicas, "step", fails)
     monkeypatch.setattr(one_scene, "measure", lambda *_: SIMD)
     monkeypatch.setitem(stages.STAGES, "report", replace(stages.STAGES["report"], work=evaluated_at_once))
-    found = run(tmp_path / "run", "md", starts="one")
+    found = run(tmp_path / "run", "md", starts="one", budget_s=150.0)
     assert ended(found) == [("md", "done"), ("held-out md", "done"), ("report", "done")]
     assert found["rates"]["platform"] == "auto" and "blew up" in found["decision"]["why"][0]
     assert "MD by SIMD replicas failed (" in (tmp_path / "run" / "log.txt").read_text("utf-8")
@@ -283,7 +285,7 @@ def test_where_simd_blow_up_openmm_goes_on_and_nothing_is_lost(
     assert len(kept["md-openmm.h5"]) > 20 and len(kept["held_out-openmm.h5"]) > 20
     evaluated = [Path(name).name for name in (*found["trajectory"], *found["held_out"])]
     assert sorted(evaluated) == sorted(kept) and "md-openmm.h5" in evaluated[: len(found["trajectory"])]
-    assert run(tmp_path / "run", "md", resume=True, starts="one")["outcome"] == found["outcome"]
+    assert run(tmp_path / "run", "md", resume=True, starts="one", budget_s=150.0)["outcome"] == found["outcome"]
 
 
 @pytest.mark.parametrize(
