@@ -384,7 +384,7 @@ def reversible(counts: FloatArray, settled: float = 0.0) -> list[tuple[FloatArra
     """
     both, out = counts + counts.transpose(0, 2, 1), counts.sum(2)
     with np.errstate(all="ignore"):  # a jump too far gives no numbers
-        y = _fixed_point(both, out, np.log(both.sum(2) / both.sum((1, 2))[:, None]), settled)
+        y = _fixed_point(both, out, np.log(both.sum(2) / both.reshape(len(both), -1).sum(1)[:, None]), settled)
         w = out * np.exp(-y)
         flux = both / (w[:, :, None] + w[:, None])
         total = flux.sum(2)
@@ -414,8 +414,8 @@ def _fixed_point(both: FloatArray, out: FloatArray, y: FloatArray, settled: floa
             if done.all():
                 return found
             left, both, out, y, second, r, v, moved = (a[~done] for a in (left, both, out, y, second, r, v, moved))
-        ratio = np.sqrt((r * r).sum(1)) / np.maximum(np.sqrt((v * v).sum(1)), 1e-300)
-        further = np.minimum(np.fmax(1.0, ratio), _FURTHEST)[:, None]
+        length_r, length_v = (np.sqrt(a[:, None] @ a[:, :, None])[:, 0] for a in (r, v))
+        further = np.minimum(np.fmax(1.0, length_r / np.maximum(length_v, 1e-300)), _FURTHEST)
         jumped = step(y + 2.0 * further * r + further**2 * v)
         # A jump too far is none.
         y = np.where(np.abs(jumped - second).max(1, keepdims=True) < _LONGEST_JUMP, jumped, second)
