@@ -183,7 +183,7 @@ class Potential(Propagator):
         return self.exact_gradient(positions_nm, molecule)
 
     def exact_gradient(self, positions_nm: Tensor, molecule: Molecule) -> GradientFn:
-        """Return the same to the last digit of the positions' type, for many calls near these frames."""
+        """Return the same in the precision of the positions, which SIMD has not."""
         return gradient_of(lambda x: self.energies(x, molecule))
 
     def evaluate(self, positions_nm: Tensor, molecule: Molecule) -> Evaluation:
