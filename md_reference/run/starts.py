@@ -35,8 +35,8 @@ _COOLING = 0.2
 # By OpenMM, one after the other: so far apart, of that time.
 _APART = 0.2
 _TURNED_PS, _LEAST_TURNED, _STIFFNESS_KJ_MOL = 20.0, 0.2, 300.0
-# Steps of minimisation before MD: to the very minimum a box of water takes three to five times as long, and MD then
-# begins too cold.
+# Steps of minimisation before MD: to the very minimum a box of water takes several times as long, and MD then begins
+# too cold.
 _MINIMISED = 200
 _PIECE = 500
 # A scene for each replica, and how they were found, in a few words.

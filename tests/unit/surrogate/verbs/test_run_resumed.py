@@ -36,7 +36,7 @@ AT_ONCE = n_replicas() if HAS_COMPILER else 4
 OPENMM, SIMD = RATES, replace(RATES, platform="simd", at_once=AT_ONCE, md_ps_per_s=0.8)
 # As if the molecule were in water, and the water not there.
 WET = replace(SIMD, explicit=True, step_s=1e-4, md_ps_per_s=8.0)
-# Of which lengths are: in so much MD under an umbrella is worth beginning, and not much longer than it must be.
+# Budgets that lengths of runs follow from, where not BUDGET_S: MD under an umbrella just about pays in so much.
 LENGTHS_OF_S = {WET: 220.0}
 WAYS = [
     pytest.param(("md", OPENMM, ["md", "held-out md", "report"]), id="one replica"),
