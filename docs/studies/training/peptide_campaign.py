@@ -81,12 +81,12 @@ TURNED_PS, STIFFNESS_KJ_MOL = 20.0, 300.0
 # For an umbrella potential: the MD in OBC2 that tells it, its first part left out where starts are drawn, and the runs
 # in water.
 RESOLVED_PS, RESOLVED_EVERY_PS, RELAXED = 1200.0, 0.4, 0.2
-# The share of frames that is to count in effect: of longer chains more of the free energies is left, in steps, in kT.
-# Frames drawn that tell one in OBC2, and how long their bonds take to settle.
-COUNTING, LIGHTER_KT = 0.2, 0.5
-DRAWN, SETTLED_PS = 4000, 2.0
 UMBRELLA_PS, UMBRELLA_TEST_PS = 200.0, 500.0
-# In OBC2: of what the wide campaign has after so many molecules. Chains come first: weights that learned 85 molecules,
+# In OBC2: the frames drawn that tell it, and how long their bonds take to settle; the share of MD's frames that is to
+# count in effect, for which more of the free energies is left, in steps in kT.
+DRAWN, SETTLED_PS = 4000, 2.0
+COUNTING, LIGHTER_KT = 0.2, 0.5
+# Of what the wide campaign has after so many molecules. Chains come first: weights that learned 85 molecules,
 # all pairs, came nearer to pairs and farther from chains.
 WIDE_FIRST, UMBRELLA_WIDE_PS, UMBRELLA_SAVED_PS = 184, 800.0, 2.0
 

@@ -36,8 +36,8 @@ AT_ONCE = n_replicas() if HAS_COMPILER else 4
 OPENMM, SIMD = RATES, replace(RATES, platform="simd", at_once=AT_ONCE, md_ps_per_s=0.8)
 # As if the molecule were in water, and the water not there.
 WET = replace(SIMD, explicit=True, step_s=1e-4, md_ps_per_s=8.0)
-# Budgets that lengths of runs follow from, where not BUDGET_S: MD under an umbrella just about pays in so much.
-LENGTHS_OF_S = {WET: 220.0}
+# The budget that is just enough for MD under an umbrella, more for more replicas; lengths of such runs are that of it.
+UMBRELLA_S = next(s for s in range(110, 600, 5) if decide(WET, s, "surrogate").seconds("umbrella md") > 0.0)
 WAYS = [
     pytest.param(("md", OPENMM, ["md", "held-out md", "report"]), id="one replica"),
     pytest.param(("md", SIMD, ["md", "report"]), id="simd", marks=needs_compiler),
@@ -64,15 +64,13 @@ class Killed(BaseException):
     """Nobody catches it: what is on disk is what a kill leaves."""
 
 
-def run(
-    folder: Path, asked: str, *, resume: bool = False, starts: str = "many", budget_s: float = BUDGET_S
-) -> dict[str, Any]:
-    options: dict[str, Any] = {"budget_s": budget_s, "way": asked, "resume": resume, "starts": starts}
+def run(folder: Path, asked: str, *, resume: bool = False, starts: str = "many") -> dict[str, Any]:
+    options: dict[str, Any] = {"budget_s": BUDGET_S, "way": asked, "resume": resume, "starts": starts}
     return api.run("alanine-dipeptide", folder, quiet=True, **options)
 
 
 def as_if_measured_at_once(rates: Rates, _: float, *how: Any, **more: Any) -> Decision:
-    return decide(rates, LENGTHS_OF_S.get(rates, BUDGET_S), *how, **more)
+    return decide(rates, UMBRELLA_S if rates == WET else BUDGET_S, *how, **more)
 
 
 def frames(folder: Path) -> dict[str, Any]:
@@ -173,7 +171,7 @@ def test_md_under_an_umbrella_gives_the_answer_and_the_starts_of_held_out_md(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(one_scene, "measure", lambda *_: WET)
-    monkeypatch.setattr(one_scene, "decide", as_if_measured_at_once)
+    monkeypatch.setattr(one_scene, "decide", lambda rates, left_s, *how, **more: decide(rates, BUDGET_S, *how, **more))
     monkeypatch.setitem(stages.STAGES, "report", replace(stages.STAGES["report"], work=evaluated_at_once))
     folder, begun = tmp_path / "a", []
     simulated = replicas.simulate_batch
@@ -223,8 +221,7 @@ def test_a_run_in_water_goes_on_with_the_stages_that_it_began_with(
     monkeypatch.setattr(one_scene, "decide", lambda rates, left_s, *how, whole_s=0.0, **more:
                         decide(rates, whole_s or left_s, *how, **more))  # fmt: skip
     monkeypatch.setitem(stages.STAGES, "report", replace(stages.STAGES["report"], work=evaluated_at_once))
-    enough_s = next(s for s in range(200, 600, 5) if decide(WET, s, "surrogate").seconds("umbrella md") > 0.0)
-    short_s, long_s = enough_s - 5.0, enough_s + 25.0
+    short_s, long_s = UMBRELLA_S - 5.0, UMBRELLA_S + 25.0
     options: dict[str, Any] = {"way": "surrogate", "quiet": True}
     first = api.run("alanine-dipeptide", tmp_path / "a", budget_s=short_s, **options)
     names = ["rollout", "held-out md", "report"]
@@ -275,7 +272,7 @@ def test_where_simd_blow_up_openmm_goes_on_and_nothing_is_lost(
     monkeypatch.setattr(SimdReplicas, "step", fails)
     monkeypatch.setattr(one_scene, "measure", lambda *_: SIMD)
     monkeypatch.setitem(stages.STAGES, "report", replace(stages.STAGES["report"], work=evaluated_at_once))
-    found = run(tmp_path / "run", "md", starts="one", budget_s=150.0)
+    found = run(tmp_path / "run", "md", starts="one")
     assert ended(found) == [("md", "done"), ("held-out md", "done"), ("report", "done")]
     assert found["rates"]["platform"] == "auto" and "blew up" in found["decision"]["why"][0]
     assert "MD by SIMD replicas failed (" in (tmp_path / "run" / "log.txt").read_text("utf-8")
@@ -285,7 +282,7 @@ def test_where_simd_blow_up_openmm_goes_on_and_nothing_is_lost(
     assert len(kept["md-openmm.h5"]) > 20 and len(kept["held_out-openmm.h5"]) > 20
     evaluated = [Path(name).name for name in (*found["trajectory"], *found["held_out"])]
     assert sorted(evaluated) == sorted(kept) and "md-openmm.h5" in evaluated[: len(found["trajectory"])]
-    assert run(tmp_path / "run", "md", resume=True, starts="one", budget_s=150.0)["outcome"] == found["outcome"]
+    assert run(tmp_path / "run", "md", resume=True, starts="one")["outcome"] == found["outcome"]
 
 
 @pytest.mark.parametrize(

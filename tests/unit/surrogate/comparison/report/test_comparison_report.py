@@ -202,7 +202,7 @@ def test_markdown_goes_beside_the_page(folder: Path) -> None:
 def test_every_type_of_chart_is_drawn_and_written(comparison: Comparison) -> None:
     charts = one_of_each_type()
     first = comparison.evaluations[0]
-    # Of the comparison's own what stands beside one of them: drawing all takes seconds.
+    # The comparison's charts in the same sections alone: drawing all takes seconds.
     beside = [c for c in first.charts if c.section in {c.section for c in charts}]
     plain = {a.title: a for a in albums(beside, 300.0)}
     drawn = {a.title: a for a in albums((*charts, *beside), 300.0)}
