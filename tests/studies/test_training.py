@@ -389,13 +389,7 @@ def test_steps_are_taught_to_keep_what_is_drawn_at_endless_times(
 ) -> None:
     """By other weights, by which psi of alanine is in its second state more often."""
     some = wide_peptides()[:2]
-    for name, value in {
-        "_FRAMES": 300,
-        "_HELD": 1,
-        "_RATE": 2e-2,
-        "_WINDOWS": 128,
-        "wide_peptides": lambda: some,
-    }.items():
+    for name, value in {"_FRAMES": 300, "_HELD": 1, "_RATE": 2e-2, "wide_peptides": lambda: some}.items():
         monkeypatch.setattr(peptide_equilibrium, name, value)
     shipped = load_weights(weights_path("peptides"))
     begun, other = (cast(PeptideSlide, load_weights(weights_path("peptides")).model) for _ in range(2))
