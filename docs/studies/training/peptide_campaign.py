@@ -1,6 +1,7 @@
 """Peptides by SIMD replicas, in TIP3P water or in OBC2: what models learn from and are tested on.
 
     python docs/studies/training/peptide_campaign.py FOLDER --budget 3h [--workers 1] [--solvent obc2]
+          [--molecules NAME ...]
     python docs/studies/training/peptide_campaign.py FOLDER --list [--solvent obc2]
     python docs/studies/training/peptide_campaign.py FOLDER --budget 3h --umbrella [--workers 1] [--solvent obc2]
 
@@ -266,6 +267,14 @@ def umbrella_order(solvent: str) -> list[tuple[str, Peptide, int]]:
             if (p.name, number) not in known]  # fmt: skip
 
 
+def batches(solvent: str, with_umbrella: bool, names: Sequence[str]) -> list[tuple[str, Peptide, int]]:
+    """Return the batches of molecules of these names, of all without any."""
+    found = (umbrella_order if with_umbrella else order)(solvent)
+    if unknown := sorted({*names} - {p.name for _, p, _ in found}):
+        raise SystemExit(f"The campaign holds no {', '.join(unknown)}; names are like LEU-SER and free-MET-SER.")
+    return [task for task in found if not names or task[1].name in names]
+
+
 def make(task: tuple[str, Peptide, int], deadline: float, folder: str, solvent: str) -> None:
     kind, peptide, number = task
     with_umbrella = kind.startswith("umbrella")
@@ -283,9 +292,10 @@ SWITCHES = {
 
 def main(arguments: Sequence[str] | None = None) -> None:
     chosen = arguments_of(__doc__, SWITCHES, arguments, solvents=SAVED_PS)
-    tasks = partial(umbrella_order if chosen.umbrella else order, chosen.solvent)
+    tasks = partial(batches, chosen.solvent, chosen.umbrella, chosen.molecules)
+    found = tasks()
     if chosen.list:
-        for kind, peptide, number in tasks():
+        for kind, peptide, number in found:
             done = len(list((chosen.folder / kind / peptide.name).glob("run_*.h5"))) - number * n_replicas()
             if done > 0:
                 sys.stdout.write(f"{kind} {peptide.name} {min(done, n_replicas())} x {peptide.time_ps:g} ps\n")

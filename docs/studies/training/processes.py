@@ -28,7 +28,7 @@ def arguments_of(
     about: str | None, switches: Mapping[str, str], given: Sequence[str] | None, solvents: Collection[str] = ()
 ) -> argparse.Namespace:  # fmt: skip
     """Read the command line that these commands have in common, switches of their own with a help text each, and the
-    solvent where there is a choice, by default the first."""
+    solvent, by default the first, and molecules where there is a choice."""
     parser = argparse.ArgumentParser(description=about, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folder", type=Path)
     parser.add_argument("--budget", default="3h", help="wall time after which no further run is begun")
@@ -37,6 +37,9 @@ def arguments_of(
         parser.add_argument(switch, action="store_true", help=help)
     if solvents:
         parser.add_argument("--solvent", choices=list(solvents), default=next(iter(solvents)))
+        parser.add_argument(
+            "--molecules", nargs="+", default=(), metavar="NAME", help="these alone"
+        )
     chosen = parser.parse_args(given)
     chosen.budget_s = parse_wall_s(chosen.budget, "--budget")
     return chosen

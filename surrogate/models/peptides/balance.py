@@ -35,9 +35,10 @@ _PASSES = 4
 _RIDGE, _MOST = 0.3, 3.0
 # Of changes between other states: frames of equilibrium by which they are counted, and after how many steps of a
 # rollout: in one step many go back and forth over a barrier. How often levels are moved, how far, squared, what one
-# level says for all peptides is from each, and what holds levels near zero.
+# level says for all peptides is from each, and what holds levels near zero. Steps after which runs are as far on their
+# way to equilibrium as the first number says do not tell how fast.
 _FRAMES, _STEP_PS, _STEPS = 1000, 10.0, (2, 10)
-_CHANGES_PASSES, _MOLECULES_DIFFER, _CHANGES_RIDGE = 3, 0.1, 5.0
+_MIXED, _CHANGES_PASSES, _MOLECULES_DIFFER, _CHANGES_RIDGE = 0.8, 3, 0.1, 5.0
 # Variances of how far logarithms of ratios of populations are off in another solvent: between types of residues, and of
 # what all have alike. With more for types, pairs that are left out come out worse (docs/results/water.md).
 _TYPES_DIFFER, _LACKING_ALIKE = 0.1, 1.0
@@ -116,29 +117,21 @@ def _balance(model: PeptideSlide, jumps: StateJumps, subjects: Sequence[PeptideS
 
 @torch.no_grad()
 def set_pace(model: PeptideSlide, subjects: Sequence[PeptideSubject]) -> None:
-    """Move how often psi changes its state beside other residues, by one factor for any residue before it and one for
-    any after, to what the runs of `subjects` in a solvent show. A few ns of each say no more: not which side is
-    likelier, nor how residues differ. Residues between caps keep their pace."""
-    ends = _ends(model)
+    """Move how often torsions change their states to what the runs of `subjects` in a solvent show in the mean, by what
+    `_alike` has. A few ns of each say no more: not which side is likelier, nor how residues differ."""
     for solvent, jumps in enumerate(cast(list[StateJumps], list(model.all_jumps))):
         some = [s for s in subjects if s.chain.solvent == solvent]
         for _ in range(_CHANGES_PASSES if some else 0):
-            found = [change for subject in some for change in changes(model, subject) if change.torsion == _PSI]
-            beside = torch.tensor([[kind not in ends for kind in c.types[1:]] for c in found]).double().reshape(-1, 2)
-            factors = _nearest(beside, found, [change.slow for change in found])
-            levels = jumps.of_change.new_zeros(3, jumps.of_change.shape[1])
-            levels[1:] = factors[:, None]
-            levels[1:, ends] = 0.0
-            for a, b in ((0, 1), (1, 0)):
-                jumps.raise_change(_PSI, a, b, levels)
+            found: dict[tuple[int, int, int], list[tuple[Sequence[int], float, float]]] = {}
+            for c in (change for subject in some for change in changes(model, subject)):
+                found.setdefault((c.torsion, *c.states), []).append((c.types[1:], c.slow, c.counted / _CHANGES_RIDGE))
+            _alike(model, jumps, found)
 
 
 @torch.no_grad()
 def transfer(model: PeptideSlide, subjects: Sequence[PeptideSubject]) -> None:
-    """Give other solvents the probabilities of the first, changes as often as they have them: by one factor for every
-    two states of a kind of torsion, and for psi one more beside a residue before and one beside a residue after.
+    """Give other solvents the probabilities of the first, changes as often as they have them, by what `_alike` has.
     Little MD tells these factors, in the mean over frames of `subjects` in a solvent, and not what each type does."""
-    ends = _ends(model)
     for solvent, jumps in enumerate(cast(list[StateJumps], list(model.all_jumps))):
         some = [s for s in subjects if s.chain.solvent == solvent and solvent > 0]
         if not some:
@@ -146,21 +139,32 @@ def transfer(model: PeptideSlide, subjects: Sequence[PeptideSubject]) -> None:
         wanted = [_paces(model, subject) for subject in some]
         jumps.load_state_dict(model.jumps.state_dict())
         for _ in range(_CHANGES_PASSES):
-            found: dict[tuple[int, int, int], list[tuple[list[float], float]]] = {}
+            found: dict[tuple[int, int, int], list[tuple[Sequence[int], float, float]]] = {}
             for subject, own in zip(some, wanted, strict=True):
                 types = subject.chain.places[:, 1:3].tolist()
                 for (r, torsion, a, b), pace in _paces(model, subject).items():
-                    beside = [float(torsion == _PSI and kind not in ends) for kind in types[r]]
-                    found.setdefault((torsion, a, b), []).append(([1.0, *beside], own[r, torsion, a, b] - pace))
-            for (torsion, a, b), each in found.items():
-                parts, lacking = (torch.tensor(x).double() for x in zip(*each, strict=True))
-                held = parts.T @ parts + _RIDGE * torch.eye(3)
-                levels = (
-                    torch.linalg.solve(held, parts.T @ lacking).float()[:, None].repeat(1, jumps.of_change.shape[1])
-                )
-                levels[1:, ends] = 0.0
-                jumps.raise_change(torsion, a, b, levels.to(jumps.of_change.device))
-                jumps.raise_change(torsion, b, a, levels.to(jumps.of_change.device))
+                    lacking = own[r, torsion, a, b] - pace
+                    found.setdefault((torsion, a, b), []).append((types[r], lacking, 1.0 / _RIDGE))
+            _alike(model, jumps, found)
+
+
+def _alike(
+    model: PeptideSlide, jumps: StateJumps,
+    found: Mapping[tuple[int, int, int], Sequence[tuple[Sequence[int], float, float]]],
+) -> None:  # fmt: skip
+    """Make changes between two states, by (torsion, state, state), rarer or more frequent either way, all residues
+    alike, psi by one factor more beside any residue before and one beside any after. `found`: of some residues the
+    types before and after, what the logarithm lacks, and what that counts; factors are held near one."""
+    ends = _ends(model)
+    for (torsion, a, b), each in found.items():
+        parts = [[1.0, *(float(torsion == _PSI and kind not in ends) for kind in types)] for types, *_ in each]
+        part, lacking = torch.tensor(parts).double(), torch.tensor([x for _, x, _ in each]).double()
+        weighed = torch.tensor([count for *_, count in each]).double() * part.T
+        factors = torch.linalg.solve(weighed @ part + torch.eye(3), weighed @ lacking).float()
+        levels = factors[:, None].repeat(1, jumps.of_change.shape[1])
+        levels[1:, ends] = 0.0
+        for start, end in ((a, b), (b, a)):
+            jumps.raise_change(torsion, start, end, levels.to(jumps.of_change.device))
 
 
 def _paces(model: PeptideSlide, subject: PeptideSubject) -> dict[tuple[int, int, int, int], float]:
@@ -246,12 +250,20 @@ def changes(model: PeptideSlide, subject: PeptideSubject) -> list[Change]:
     if not len(idx):
         return []
     flux, shares, held = _fluxes(model, subject, idx, generator)
-    both = torch.zeros(2, *flux.shape)
+    both, lags = torch.zeros(2, *flux.shape), torch.zeros(flux.shape)
     is_now = F.one_hot(subject.states(idx), chains.MOST_STATES).float()
+    now = is_now.mean(0)
     for k, ours in zip(_STEPS, shares, strict=True):
         then = F.one_hot(subject.states(idx + _step(subject) * k), chains.MOST_STATES).float()
-        fluxes = torch.stack([torch.einsum("nrka,nrkb->rkab", is_now, later) for later in (ours, then)])
-        both += ends_to_end * _STEPS[-1] / k / _FRAMES / len(_STEPS) * (fluxes + fluxes.mT)
+        fluxes = torch.stack([torch.einsum("nrka,nrkb->rkab", is_now, later) for later in (ours, then)]) / _FRAMES
+        either = fluxes + fluxes.mT
+        mixed = either / (2.0 * now[..., :, None] * now[..., None, :]).clamp(min=1e-6)
+        # The last ones that went over come back; so many would have gone.
+        gone = either * -torch.log1p(-mixed.clamp(1e-6, _MIXED)) / mixed.clamp(1e-6, _MIXED)
+        tells = (mixed[1] < _MIXED) | (lags == 0)
+        both += tells * ends_to_end * _STEPS[-1] / k * gone
+        lags += tells
+    both /= lags
     types, found = subject.chain.places[:, :3].tolist(), []
     for r, k, a, b in _pairs_of_states(subject, held):
         expected, seen = both[:, r, k, a, b].tolist()
