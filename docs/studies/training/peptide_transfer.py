@@ -12,8 +12,8 @@ molecules of several residues one is left out, and the curves show its loss. `--
 energies of φ > 0 are those of `peptide_energies` beside OUT, or those that the weights gone on from were trained with.
 A training that was stopped goes on. These train nothing: `transfer` gives TIP3P the probabilities of OBC2, as often as
 its own have it (`balance.transfer`), in the mean over rollouts in it, which lie beside OUT, those of OBC2 as other
-weights have them where these are named by `--of`; `pace` sets how often torsions change their states to what runs show
-in the mean (`balance.set_pace`). Populations: `peptide_populations`.
+weights have them where these are named by `--of`; `pace` sets how often ψ changes its state beside other residues to
+what runs show (`balance.set_pace`). Populations: `peptide_populations`.
 """
 
 from __future__ import annotations

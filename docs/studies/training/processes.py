@@ -37,9 +37,7 @@ def arguments_of(
         parser.add_argument(switch, action="store_true", help=help)
     if solvents:
         parser.add_argument("--solvent", choices=list(solvents), default=next(iter(solvents)))
-        parser.add_argument(
-            "--molecules", nargs="+", default=(), metavar="NAME", help="these alone"
-        )
+        parser.add_argument("--molecules", nargs="+", default=(), metavar="NAME", help="these alone")
     chosen = parser.parse_args(given)
     chosen.budget_s = parse_wall_s(chosen.budget, "--budget")
     return chosen

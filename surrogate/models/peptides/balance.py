@@ -63,7 +63,8 @@ class Phi(NamedTuple):
 class Change(NamedTuple):
     """Two states of one torsion of a residue: the `types` of the residue and of those beside it, which `torsion`, both
     states, the logarithm of how many more frames go back from the second than to it, and how far, squared, it errs; and
-    how many changes of either direction are `expected` and `seen` in as many windows as the runs hold end to end."""
+    how many changes of either direction are `expected` and `seen` in as many windows as the runs hold end to end,
+    those included that went back."""
 
     types: tuple[int, int, int]
     torsion: int
@@ -117,21 +118,29 @@ def _balance(model: PeptideSlide, jumps: StateJumps, subjects: Sequence[PeptideS
 
 @torch.no_grad()
 def set_pace(model: PeptideSlide, subjects: Sequence[PeptideSubject]) -> None:
-    """Move how often torsions change their states to what the runs of `subjects` in a solvent show in the mean, by what
-    `_alike` has. A few ns of each say no more: not which side is likelier, nor how residues differ."""
+    """Move how often psi changes its state beside other residues, by one factor for any residue before it and one for
+    any after, to what the runs of `subjects` in a solvent show. A few ns of each say no more: not which side is
+    likelier, nor how residues differ. Residues between caps keep their pace."""
+    ends = _ends(model)
     for solvent, jumps in enumerate(cast(list[StateJumps], list(model.all_jumps))):
         some = [s for s in subjects if s.chain.solvent == solvent]
         for _ in range(_CHANGES_PASSES if some else 0):
-            found: dict[tuple[int, int, int], list[tuple[Sequence[int], float, float]]] = {}
-            for c in (change for subject in some for change in changes(model, subject)):
-                found.setdefault((c.torsion, *c.states), []).append((c.types[1:], c.slow, c.counted / _CHANGES_RIDGE))
-            _alike(model, jumps, found)
+            found = [change for subject in some for change in changes(model, subject) if change.torsion == _PSI]
+            beside = torch.tensor([[kind not in ends for kind in c.types[1:]] for c in found]).double().reshape(-1, 2)
+            factors = _nearest(beside, found, [change.slow for change in found])
+            levels = jumps.of_change.new_zeros(3, jumps.of_change.shape[1])
+            levels[1:] = factors[:, None]
+            levels[1:, ends] = 0.0
+            for a, b in ((0, 1), (1, 0)):
+                jumps.raise_change(_PSI, a, b, levels)
 
 
 @torch.no_grad()
 def transfer(model: PeptideSlide, subjects: Sequence[PeptideSubject]) -> None:
-    """Give other solvents the probabilities of the first, changes as often as they have them, by what `_alike` has.
+    """Give other solvents the probabilities of the first, changes as often as they have them: by one factor for every
+    two states of a kind of torsion, and for psi one more beside a residue before and one beside a residue after.
     Little MD tells these factors, in the mean over frames of `subjects` in a solvent, and not what each type does."""
+    ends = _ends(model)
     for solvent, jumps in enumerate(cast(list[StateJumps], list(model.all_jumps))):
         some = [s for s in subjects if s.chain.solvent == solvent and solvent > 0]
         if not some:
@@ -139,32 +148,21 @@ def transfer(model: PeptideSlide, subjects: Sequence[PeptideSubject]) -> None:
         wanted = [_paces(model, subject) for subject in some]
         jumps.load_state_dict(model.jumps.state_dict())
         for _ in range(_CHANGES_PASSES):
-            found: dict[tuple[int, int, int], list[tuple[Sequence[int], float, float]]] = {}
+            found: dict[tuple[int, int, int], list[tuple[list[float], float]]] = {}
             for subject, own in zip(some, wanted, strict=True):
                 types = subject.chain.places[:, 1:3].tolist()
                 for (r, torsion, a, b), pace in _paces(model, subject).items():
-                    lacking = own[r, torsion, a, b] - pace
-                    found.setdefault((torsion, a, b), []).append((types[r], lacking, 1.0 / _RIDGE))
-            _alike(model, jumps, found)
-
-
-def _alike(
-    model: PeptideSlide, jumps: StateJumps,
-    found: Mapping[tuple[int, int, int], Sequence[tuple[Sequence[int], float, float]]],
-) -> None:  # fmt: skip
-    """Make changes between two states, by (torsion, state, state), rarer or more frequent either way, all residues
-    alike, psi by one factor more beside any residue before and one beside any after. `found`: of some residues the
-    types before and after, what the logarithm lacks, and what that counts; factors are held near one."""
-    ends = _ends(model)
-    for (torsion, a, b), each in found.items():
-        parts = [[1.0, *(float(torsion == _PSI and kind not in ends) for kind in types)] for types, *_ in each]
-        part, lacking = torch.tensor(parts).double(), torch.tensor([x for _, x, _ in each]).double()
-        weighed = torch.tensor([count for *_, count in each]).double() * part.T
-        factors = torch.linalg.solve(weighed @ part + torch.eye(3), weighed @ lacking).float()
-        levels = factors[:, None].repeat(1, jumps.of_change.shape[1])
-        levels[1:, ends] = 0.0
-        for start, end in ((a, b), (b, a)):
-            jumps.raise_change(torsion, start, end, levels.to(jumps.of_change.device))
+                    beside = [float(torsion == _PSI and kind not in ends) for kind in types[r]]
+                    found.setdefault((torsion, a, b), []).append(([1.0, *beside], own[r, torsion, a, b] - pace))
+            for (torsion, a, b), each in found.items():
+                parts, lacking = (torch.tensor(x).double() for x in zip(*each, strict=True))
+                held = parts.T @ parts + _RIDGE * torch.eye(3)
+                levels = (
+                    torch.linalg.solve(held, parts.T @ lacking).float()[:, None].repeat(1, jumps.of_change.shape[1])
+                )
+                levels[1:, ends] = 0.0
+                jumps.raise_change(torsion, a, b, levels.to(jumps.of_change.device))
+                jumps.raise_change(torsion, b, a, levels.to(jumps.of_change.device))
 
 
 def _paces(model: PeptideSlide, subject: PeptideSubject) -> dict[tuple[int, int, int, int], float]:

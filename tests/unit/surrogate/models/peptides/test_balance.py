@@ -131,9 +131,9 @@ def test_a_solvent_is_balanced_by_frames_in_it() -> None:
     assert max(abs(change.lacking) for change in changes(model, wet)) < 0.5 * max(before)
 
 
-def test_the_pace_is_one_factor_for_all_and_one_beside_other_residues() -> None:
+def test_the_pace_beside_other_residues_is_one_factor_a_side() -> None:
     sets = [_jumping(_frames(f"ACE-{name}-NME", kind="psi"), often, 0.05)
-            for name, often in (("ALA-SER", 0.05), ("SER-ALA", 0.1), ("SER", 0.2), ("ALA", 0.2))]  # fmt: skip
+            for name, often in (("ALA-SER", 0.1), ("SER-ALA", 0.2), ("SER", 0.2))]  # fmt: skip
     config = PeptideConfig(width=16, n_layers=1, n_heads=1, chunk_frames=4, solvents=("obc2", "tip3p"))
     config = with_scale(config, sets)
     subjects = [PeptideSubject(f, chain_features(f.scene, config, "tip3p"), np.ones(2 * EACH)) for f in sets]
@@ -141,18 +141,15 @@ def test_the_pace_is_one_factor_for_all_and_one_beside_other_residues() -> None:
     model = PeptideSlide(config).requires_grad_(False)
     jumps, start = model.jumps_elsewhere[0], {name: x.clone() for name, x in model.named_parameters()}
 
-    def slow() -> list[float]:
-        """Of pairs and of residues between caps, in the mean."""
-        return [float(np.mean([c.slow for subject in some for c in changes(model, subject) if c.torsion == 1]))
-                for some in (subjects[:2], subjects[2:])]  # fmt: skip
+    def slow(some: list[PeptideSubject]) -> float:
+        return float(np.mean([change.slow for subject in some for change in changes(model, subject)]))
 
-    before = slow()
-    assert before[0] > 1.0 and before[1] - before[0] > 0.2
-    set_pace(model, subjects)
-    assert np.abs(slow()).max() < 0.1
+    pairs, alone = slow(subjects[:2]), slow(subjects[2:])
+    assert min(pairs, alone) > 1.0
+    set_pace(model, subjects[:2])
+    assert abs(slow(subjects[:2])) < 0.2 * pairs and slow(subjects[2:]) == alone, "beside caps it stays"
     moved = {name for name, x in model.named_parameters() if not torch.equal(x, start[name])}
-    assert moved == {f"jumps_elsewhere.0.{which}_change" for which in ("of", "beside")}
-    assert torch.equal(jumps.of_change[0, 0, 1], jumps.of_change[0, -1, 1]), "all residues alike"
+    assert moved == {"jumps_elsewhere.0.beside_change"}
     of = {name: jumps.beside_change[:, 2 + config.types.index(name), 1] for name in config.types}
     assert of["ALA"].equal(of["SER"]) and not of["ACE"].any() and not of["NME"].any()
     assert of["ALA"][:, 0, 1].equal(of["ALA"][:, 1, 0]), "either direction alike"
