@@ -37,6 +37,8 @@ UNSEEN_FREE = (("GLY", "VAL"), ("ALA", "TYR"))
 _UNSEEN_TETRAPEPTIDES = 11
 FIRST_TESTS = 14
 _WIDE_PAIRS, _WIDE_CHAINS, _WIDE_FREE_ROUNDS, _WIDE_SEED, _WIDE_PS = 300, 200, 3, 43, 2000.0
+# What weights know least of.
+_FREE_CHAINS, _FREE_SEED = 120, 44
 _TEST_STARTS = 16
 _PAIR_ROUNDS = 3
 _CHAINS = 12
@@ -107,7 +109,8 @@ def unseen_tetrapeptides() -> list[tuple[str, ...]]:
 def wide_peptides() -> tuple[Peptide, ...]:
     """Return the molecules of the wide campaign, by which states of torsions may be coupled along the chain: monomers,
     then by turns pairs, chains of three and four residues, a third of these with free ends, and pairs with free ends
-    that every residue bears, so that any beginning is a fair part; sixteen runs of 2 ns each."""
+    that every residue bears, so that any beginning is a fair part; then more chains with free ends. Sixteen runs of
+    2 ns each."""
     rng = random.Random(_WIDE_SEED)
     tested = {*TEST_PAIRS, *UNSEEN_PAIRS, *TEST_CHAINS, *UNSEEN_CHAINS, *TEST_FREE_CHAINS, *UNSEEN_FREE}
     tested |= {*unseen_tetrapeptides()}
@@ -123,7 +126,9 @@ def wide_peptides() -> tuple[Peptide, ...]:
     )
     by_turns = sorted(((k + 0.5) / len(some), p.name, p) for some in kinds for k, p in enumerate(some))
     monomers = [Peptide((r,), True, _TEST_STARTS, _WIDE_PS) for r in RESIDUES]
-    return (*monomers, *(p for *_, p in by_turns))
+    further = _chains(random.Random(_FREE_SEED), {*tested, *chains}, lengths=(4, 4, 3), n=_FREE_CHAINS)
+    last = (Peptide(p, False, _TEST_STARTS, _WIDE_PS) for p in further)
+    return (*monomers, *(p for *_, p in by_turns), *last)
 
 
 def unseen_peptides() -> tuple[Peptide, ...]:
