@@ -124,12 +124,13 @@ def test_the_nearest_weights_are_those_that_could_be_forced() -> None:
     nearest = "The nearest: peptides.safetensors does not cover .* 5 amino acids; trained on up to 4"
     with pytest.raises(OutOfDomainError, match=nearest):
         choose_weights(prepare("sequence:ACE-LEU-SER-ALA-GLY-VAL-NME"))
-    for sequence, why in (
-        ("LEU-ALA-SER-ALA-GLY", "5 amino acids with free ends; trained on up to 4"),
-        ("SER-PHE", "free ends that no training peptide has: PHE-COO-"),
+    for sequence, solvent, why in (
+        ("LEU-ALA-SER-ALA-GLY", "obc2", "5 amino acids with free ends; trained on up to 4"),
+        ("SER-PHE", "tip3p", "free ends that no training peptide has: .*PHE-COO-"),
     ):
         with pytest.raises(OutOfDomainError, match=why):
-            choose_weights(prepare(f"sequence:{sequence}"))
+            choose_weights(prepare(f"sequence:{sequence}"), conditions={"solvent": solvent})
+    assert choose_weights(prepare("sequence:SER-PHE"))[0].path.stem == "peptides"
 
 
 def test_weights_of_another_force_field_are_no_choice_where_one_is_asked_for() -> None:
