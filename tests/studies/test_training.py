@@ -353,6 +353,14 @@ def test_pairs_under_an_umbrella_are_of_all_residues_and_no_test(monkeypatch: py
     assert {"LEU", "SER", "VAL", "ASN"} & set(first[0])
 
 
+def test_a_campaign_of_some_molecules_is_of_these_alone() -> None:
+    found = peptide_campaign.batches("obc2", False, ["free-GLU-GLN-LEU-PRO", "LYS-CYS"])
+    assert [(kind, p.name) for kind, p, _ in found] == [("train", "LYS-CYS"), ("test", "free-GLU-GLN-LEU-PRO")]
+    assert peptide_campaign.batches("obc2", False, ()) == peptide_campaign.order("obc2")
+    with pytest.raises(SystemExit, match="holds no ALA-FOO; names are like"):
+        peptide_campaign.batches("obc2", True, ["ALA-FOO"])
+
+
 def test_no_training_takes_what_is_tested_by(tmp_path: Path) -> None:
     for name in ("GLN-ILE", "free-GLN-ILE", "GLY-VAL"):
         (tmp_path / name / name).mkdir(parents=True)
