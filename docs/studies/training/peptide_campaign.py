@@ -293,6 +293,7 @@ SWITCHES = {
 def main(arguments: Sequence[str] | None = None) -> None:
     chosen = arguments_of(__doc__, SWITCHES, arguments, solvents=SAVED_PS)
     tasks = partial(batches, chosen.solvent, chosen.umbrella, chosen.molecules)
+    # Names that it does not hold are refused before any process begins.
     found = tasks()
     if chosen.list:
         for kind, peptide, number in found:

@@ -255,11 +255,10 @@ def changes(model: PeptideSlide, subject: PeptideSubject) -> list[Change]:
         then = F.one_hot(subject.states(idx + _step(subject) * k), chains.MOST_STATES).float()
         fluxes = torch.stack([torch.einsum("nrka,nrkb->rkab", is_now, later) for later in (ours, then)]) / _FRAMES
         either = fluxes + fluxes.mT
-        mixed = either / (2.0 * now[..., :, None] * now[..., None, :]).clamp(min=1e-6)
-        # The last ones that went over come back; so many would have gone.
-        gone = either * -torch.log1p(-mixed.clamp(1e-6, _MIXED)) / mixed.clamp(1e-6, _MIXED)
+        mixed = (either / (2.0 * now[..., :, None] * now[..., None, :]).clamp(min=1e-6)).clamp(1e-6, _MIXED)
         tells = (mixed[1] < _MIXED) | (lags == 0)
-        both += tells * ends_to_end * _STEPS[-1] / k * gone
+        # Two states mix exponentially: those that went over and came back are counted as well.
+        both += tells * ends_to_end * _STEPS[-1] / k * either * -torch.log1p(-mixed) / mixed
         lags += tells
     both /= lags
     types, found = subject.chain.places[:, :3].tolist(), []
