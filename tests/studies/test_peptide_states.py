@@ -75,6 +75,8 @@ def test_states_are_drawn_as_often_as_they_count_and_tests_are_refused(tmp_path:
     with pytest.raises(InputError, match=r"tested on GLN-ILE; leave them out"):
         read(record)
     assert read(tmp_path / "none.npz") == []
+    kinds = [Md(name, states).kind for name in ("ALA-GLY", "free-ALA-GLY", "ALA-GLY-SER", "free-ALA-GLY-SER-LEU")]
+    assert kinds == ["capped pairs", "free pairs", "capped chains", "free chains"]
 
 
 def test_halves_of_runs_are_kept_apart(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

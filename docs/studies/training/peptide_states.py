@@ -48,7 +48,7 @@ RECORD = Path(__file__).with_name("umbrella_states.npz")
 # Of each half of the runs of a molecule; of runs of which fewer frames count in effect nothing is kept but the name.
 DRAWS, LEAST_COUNTED = 2048, 100.0
 LEFT_OUT = 8
-_WINDOWS, _TIMES, _RATE, _DROPPED, _VALIDATE_S = 256, 4, 5e-4, 0.2, 30.0
+_WINDOWS, _TIMES, _RATE, _DROPPED, _VALIDATE_S = 256, 4, 5e-4, 0.2, 600.0
 # Frames of a molecule that endless times are counted from: little of them is left by then.
 _STARTS = 128
 # The share of training that keeps what is drawn of so many molecules known before.
@@ -67,8 +67,9 @@ class Md(NamedTuple):
         return self.name.removeprefix("free-") if self.name.startswith("free-") else f"ACE-{self.name}-NME"
 
     @property
-    def is_pair(self) -> bool:
-        return self.name.removeprefix("free-").count("-") == 1
+    def kind(self) -> str:
+        ends = "free" if self.name.startswith("free-") else "capped"
+        return f"{ends} {'pairs' if self.name.removeprefix('free-').count('-') == 1 else 'chains'}"
 
     def laid(self, chain: ChainFeatures) -> Tensor:
         """Return the states `(n, n_residues, MOST_TORSIONS)`."""
@@ -240,9 +241,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
         teach(a.path, start, a.steps, read())
     else:
         for name, part in zip(("left out", "learned"), reversed(parted(read())), strict=True):
-            for kind, is_pair in (("pairs", True), ("longer", False)):
-                if not (some := [md for md in part if md.is_pair == is_pair]):
-                    continue
+            for kind in sorted({md.kind for md in part}, reverse=True):
+                some = [md for md in part if md.kind == kind]
                 found = errors(model, ((md, Equilibrium.of(model, md.sequence, n_frames=_STARTS)) for md in some))
                 off, own = found["off"], found["own"]
                 sys.stdout.write(f"{len(some)} {kind} {name}: off by {off:.1f} %, MD's error {own:.1f} %\n")
