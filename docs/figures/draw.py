@@ -71,7 +71,7 @@ def draw_effective(table: dict[str, Any], out: Path) -> None:
         xlabel="effective samples of cos ψ a processor second (one core)",
         ylabel="Jensen-Shannon distance of φ/ψ maps",
         ylim=(0, 0.52),
-        xlim=(0.8, 2500),
+        xlim=(0.2, 2500),
     )
     axes.legend(frameon=False, fontsize=8, loc="lower left")
     figure.savefig(out, metadata={"Date": None})
