@@ -60,7 +60,7 @@ def draw_effective(table: dict[str, Any], out: Path) -> None:
         labelled |= {whose} if whose in COLOURS else {"OpenMM", "MD by SIMD replicas"}
         marker = "o" if whose in COLOURS else "s"
         axes.errorbar(rate, y, error, color=colour, marker=marker, capsize=2, lw=1, ms=5, ls="", label=label)
-        name = setting if whose in ("OpenMM", *COLOURS) else f"SIMD, {setting}"
+        name = setting if whose in COLOURS else row["what"].removeprefix("MD by ")
         below = name.startswith(("fitted", "gaussian", "angular 2"))
         where = {"xytext": (3, -4) if below else (-3, 4), "ha": "right" if below else "left"}
         where |= {"va": "top" if below else "bottom", "rotation": 60}
@@ -71,8 +71,8 @@ def draw_effective(table: dict[str, Any], out: Path) -> None:
         xlabel="effective samples of cos ψ a processor second (one core)",
         ylabel="Jensen-Shannon distance of φ/ψ maps",
         ylim=(0, 0.52),
-        xlim=(0.2, 2500),
     )
+    axes.margins(x=0.2)  # room for what is written beside the first and last points
     axes.legend(frameon=False, fontsize=8, loc="lower left")
     figure.savefig(out, metadata={"Date": None})
     plt.close(figure)
