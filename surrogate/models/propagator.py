@@ -97,7 +97,7 @@ class Propagator(nn.Module, ABC):
     # Shortest and longest spacing of frames of a model trained for several, and that of the frames that it returns.
     lag_range_ps: tuple[float, float] | None = None
     lag_ps: float | None = None
-    # The longest spacing at which populations are those of shorter ones; None where all are as good.
+    # The spacing up to which populations are those of the shortest; None where all are as good.
     usual_lag_ps: float | None = None
     # Which of several solvents its frames are in; None where it knows one, or means its first.
     solvent: str | None = None
@@ -125,6 +125,10 @@ class Propagator(nn.Module, ABC):
         model = copy.copy(self)
         model.lag_ps = lag_ps
         return model
+
+    def keeps_populations(self, lag_ps: float) -> bool:
+        """Whether populations by steps of `lag_ps` are those of shorter ones."""
+        return self.usual_lag_ps is None or lag_ps <= self.usual_lag_ps * (1 + 1e-6)
 
     @abstractmethod
     def noise_shape(self, n_atoms: int) -> tuple[int, ...]:

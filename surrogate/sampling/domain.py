@@ -196,8 +196,9 @@ _ROOM_OF_START = 0.85
 
 
 def choose_lag(weights: Weights, lag_ps: float | None, save_every_ps: float | None) -> float:
-    """Return the lag of a rollout: the one asked for, else the longest that is usual and that the save interval is a
-    multiple of, without either the shortest. Raises InputError for a lag that the weights were not trained for."""
+    """Return the lag of a rollout: the one asked for, else the longest that keeps populations and that the save
+    interval is a multiple of, without either the shortest. Raises InputError for a lag that the weights were not
+    trained for."""
     domain, name = weights.domain, weights.path.name
     low, high = domain.lag_ps, domain.longest_lag_ps
     if not domain.jumps:
@@ -207,8 +208,12 @@ def choose_lag(weights: Weights, lag_ps: float | None, save_every_ps: float | No
     if lag_ps is None:
         if save_every_ps is None:
             return low
-        most = min(high, weights.model.usual_lag_ps or high)
-        lag_ps = save_every_ps / max(1, math.ceil(save_every_ps / most - _ROUNDING))
+        model = weights.model
+        longest, usual = (
+            save_every_ps / max(1, math.ceil(save_every_ps / most - _ROUNDING))
+            for most in (high, min(high, model.usual_lag_ps or high))
+        )
+        lag_ps = longest if model.keeps_populations(longest) else usual
     if not low * (1 - _ROUNDING) <= lag_ps <= high * (1 + _ROUNDING):
         raise InputError(
             f"{name} was trained for lags of {format_time_ps(low)} to {format_time_ps(high)}, not for "

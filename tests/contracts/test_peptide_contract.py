@@ -136,6 +136,7 @@ def test_time_and_neighbours_and_chain_order_reach_the_flow() -> None:
 def test_a_long_lag_makes_shorter_chunks_and_none_beyond_what_was_trained() -> None:
     model = small_model()
     assert model.n_new == 5 and model.at_lag(200.0).n_new == 5 and model.at_lag(500.0).n_new == 2
+    assert model.at_lag(501.0).n_new == 20, "where no two frames fit, each is drawn on its own"
     with pytest.raises(InputError, match="2000 ps"):
         model.at_lag(2000.0)
 

@@ -13,7 +13,8 @@ from torch import Tensor
 
 from surrogate.models.peptides import chains
 from surrogate.models.peptides.layout import ENDS
-from surrogate.models.peptides.model import PeptideSlide, StateJumps, times_apart
+from surrogate.models.peptides.model import PeptideSlide, times_apart
+from surrogate.models.peptides.state_jumps import StateJumps
 from surrogate.models.peptides.subjects import PeptideSubject
 
 # Trained by log-likelihood alone, not quite as many frames of equilibrium go one way as the other, and populations err

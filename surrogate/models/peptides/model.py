@@ -12,7 +12,6 @@ overlap, are mended by small turns; chunks with frames where that is not enough 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
 from functools import partial
 from typing import ClassVar, NamedTuple, cast
 
@@ -24,232 +23,17 @@ from surrogate.models.lam_slide import flow
 from surrogate.models.layers import ParallelBlock, TimeEmbedding, rotary_angles
 from surrogate.models.peptides.chains import MOST_STATES, MOST_TORSIONS, ChainFeatures, conditioning_states, mended
 from surrogate.models.peptides.layout import PeptideConfig, chain_features
+from surrogate.models.peptides.state_jumps import FAR, Endless, StateJumps, distances_along
 from surrogate.models.propagator import Chunk, Molecule, Propagator, row_by_row
 from systems.chemistry.geometry import superpose
 from systems.errors import InputError
 from systems.scene import Scene
-
-# Which state each torsion with barriers is in, drawn before the flow draws the frames that go with it: a flow that
-# draws barrier crossings along with everything else leaks between states, and a categorical draw does not.
-
-_WIDTH = 96
-_WAVES = 8
-# Before training, a torsion changes to another state once in so many frames (in logits).
-_RARELY = -5.0
-# A step of training moves the probabilities by so many times as much as another parameter.
-_FAST = 10.0
-# Residues further apart along the chain are alike far.
-_FAR = 6
-_COUPLED_BLOCKS, _COUPLED_HEADS = 2, 4
-
-
-class StateJumps(nn.Module):
-    """The probabilities that torsions change their states between a frame and the next.
-
-    They follow from the residue's type, its numbers in the given frame, its and its two neighbours' states in that and
-    in the frame before, its own in the one before that, the new states of its torsions before this one, and both times.
-    Of neighbours' types only levels are learned, which add up: else the network would know each pair of training.
-
-    `coupled`, for trainings on many more sequences: neighbours' types count in full, attention over residues mixes what
-    the given frame tells, and every other residue sees the new states of those beside it, which are drawn first.
-    """
-
-    def __init__(self, n_slots: int, n_types: int, *, coupled: bool = False) -> None:
-        super().__init__()
-        self.coupled = coupled
-        n_states = MOST_TORSIONS * MOST_STATES
-        self.of_numbers = nn.Linear(n_slots, _WIDTH, bias=False)
-        self.of_given = nn.ModuleList(nn.Linear(n_states, _WIDTH, bias=False) for _ in range(3))
-        self.of_before = nn.ModuleList(nn.Linear(n_states, _WIDTH, bias=False) for _ in range(3))
-        self.of_earlier = nn.Linear(n_states, _WIDTH, bias=False)
-        self.of_type = nn.Embedding(n_types, _WIDTH)
-        self.waves = nn.Buffer(math.pi * torch.linspace(0.25, 2.0, _WAVES), persistent=False)
-        self.of_times = nn.Linear(4 * _WAVES + 2, _WIDTH)
-        self.of_new = nn.ModuleList(nn.Linear(n_states, _WIDTH, bias=False) for _ in range(MOST_TORSIONS))
-        self.of_torsion = nn.Embedding(MOST_TORSIONS, _WIDTH)
-        self.hidden = nn.Linear(_WIDTH, _WIDTH)
-        self.logits = nn.Linear(_WIDTH, MOST_STATES)
-        # Of each type and torsion, from one state to another: a level, and a slope with the logarithm of time.
-        self.of_change = nn.Parameter(torch.zeros(2, n_types, MOST_TORSIONS, MOST_STATES, MOST_STATES))
-        # And a level of the residue before's type, and of the one after's: proline forbids what others allow.
-        self.beside_change = nn.Parameter(torch.zeros(2, n_types, MOST_TORSIONS, MOST_STATES, MOST_STATES))
-        nn.init.zeros_(self.logits.weight)
-        nn.init.constant_(self.logits.bias, _RARELY)
-        if coupled:
-            self.of_type_beside = nn.ModuleList(nn.Embedding(n_types, _WIDTH) for _ in range(2))
-            self.blocks = nn.ModuleList(ParallelBlock(_WIDTH, _COUPLED_HEADS) for _ in range(_COUPLED_BLOCKS))
-            self.of_distance = nn.Embedding(2 * _FAR + 1, _COUPLED_HEADS)
-            self.of_new_beside = nn.ModuleList(nn.Linear(n_states, _WIDTH, bias=False) for _ in range(2))
-            # Weights that are gone on from begin as they were.
-            for part in (*self.of_type_beside, *self.of_new_beside):
-                nn.init.zeros_(cast(nn.Embedding | nn.Linear, part).weight)
-
-    @property
-    def turns(self) -> tuple[slice, ...]:
-        """The residues whose new states are drawn at once, one part after the other."""
-        return (slice(0, None, 2), slice(1, None, 2)) if self.coupled else (slice(None),)
-
-    def of_observed(self, observed: Tensor, states: Tensor, places: Tensor, counts: Tensor) -> Tensor:
-        """What all frames of a chunk have in common: `observed` (b, r, slots), its `states` (b, r, MOST_TORSIONS),
-        `places` (r, 4) -> (b, r, width)."""
-        beside = _beside(conditioning_states(states, counts))
-        h: Tensor = sum((of(x) for of, x in zip(self.of_given, beside, strict=True)), self.of_numbers(observed.float()))
-        h = h + self.of_type(places[:, 0])
-        if self.coupled:
-            h = h + sum(of(places[:, 1 + k]) for k, of in enumerate(self.of_type_beside))
-            bias = self.of_distance(distances_along(len(places), h.device)).permute(2, 0, 1)
-            still = h.new_zeros(len(h), 3, _WIDTH)
-            for block in self.blocks:
-                h = block(h[:, None], still, None, bias=bias)[0][:, 0]
-        return h
-
-    def of_new_states(self, conditioning: Tensor) -> Tensor | float:
-        """What every other residue sees of the new states beside it: `conditioning` (b, t, r, n) of the new frame ->
-        (b, t, r, width), zero for the residues of the first turn."""
-        if not self.coupled:
-            return 0.0
-        found: Tensor = sum(
-            (of(x) for of, x in zip(self.of_new_beside, _beside(conditioning)[1:], strict=True)),
-            conditioning.new_zeros(()),
-        )
-        return found * (torch.arange(found.shape[-2], device=found.device) % 2)[:, None]
-
-    def of_times_alone(
-        self, times_ps: Tensor, apart_ps: Tensor, places: Tensor, counts: Tensor
-    ) -> tuple[Tensor, Tensor]:
-        """Return what follows from frames' `times_ps` and `apart_ps` (b, t), after the given frame and after the one
-        before: `(b, t, width)`, and the levels of the probabilities `(b, t, MOST_TORSIONS, r, from, to)`."""
-        logs = torch.stack([times_ps, apart_ps], dim=-1).float().clamp(min=1e-3).log10()
-        angles = logs[..., None] * self.waves
-        waves = torch.cat([angles.sin(), angles.cos()], dim=-1).flatten(-2)
-        level, slope = (change[places[:, 0]].transpose(0, 1) for change in self.of_change)
-        for which, change in enumerate(self.beside_change):
-            level = level + _FAST * change[places[:, 1 + which]].transpose(0, 1)
-        absent = torch.arange(MOST_STATES, device=counts.device) >= counts.T[..., None, None].clamp(min=1)
-        levels = (level + slope * logs[..., 1, None, None, None, None]).masked_fill(absent, -torch.inf)
-        return self.of_times(torch.cat([waves, logs], dim=-1)), levels
-
-    def of_frames(self, conditioning: Tensor, earlier: Tensor) -> Tensor:
-        """`conditioning_states` of the frame before each, (b, t, r, n), and of the one before that, `earlier` -> (b, t,
-        r, width)."""
-        of_all = torch.cat([of.weight for of in (*self.of_before, self.of_earlier)], dim=1)
-        return F.linear(torch.cat([*_beside(conditioning), earlier], dim=-1), of_all)
-
-    def probabilities(self, torsion: int, h: Tensor, levels: Tensor, now: Tensor, conditioning: Tensor) -> Tensor:
-        """Return the logits `(b, t, r, MOST_STATES)` of the new state of one torsion of each residue.
-
-        `h` (b, t, r, width) is what `of_observed`, `of_times_alone` and `of_frames` add up to, `levels` what
-        `of_times_alone` returns; `now` (b, t, r) the torsion's state in the frame before, `conditioning` (b, t, r, n)
-        the `conditioning_states` of the new frame, of which torsions before this one count.
-        """
-        n = torsion * MOST_STATES
-        of_new = cast(nn.Linear, self.of_new[torsion]).weight
-        h = F.silu(h + F.linear(conditioning[..., :n], of_new[:, :n], self.of_torsion.weight[torsion]))
-        at = now[..., None, None].expand(*now.shape, 1, MOST_STATES)
-        level = levels[:, :, torsion].expand(*now.shape, -1, -1).gather(-2, at)[..., 0, :]
-        # To stay has the logit zero.
-        return (self.logits(F.silu(self.hidden(h))) + level).scatter(-1, now[..., None], 0.0)
-
-    @torch.no_grad()
-    def raise_change(self, torsion: int, start: int, end: int, levels: Tensor) -> None:
-        """Add `levels` (3, n_types) to the logits of one change, of the residue's type, of that before and of that
-        after."""
-        self.of_change[0, :, torsion, start, end] += levels[0]
-        self.beside_change[:, :, torsion, start, end] += levels[1:] / _FAST
-
-    def loss(
-        self, observed: Tensor, states: Tensor, places: Tensor, counts: Tensor, times_ps: Tensor, apart_ps: Tensor,
-        share: Tensor | None = None, kept: Tensor | float = 1.0,
-    ) -> Tensor:  # fmt: skip
-        """Return the negative log-likelihood of what torsions did, per frame and torsion.
-
-        `observed` (b, r, slots); `states` (b, 1 + t, r, MOST_TORSIONS), the given frame's first; `share` (b, r,
-        MOST_TORSIONS): what each torsion's change counts in a window, 1 where it is not given; `kept` (b, 1, r, width):
-        factors of hidden numbers.
-        """
-        total = observed.new_zeros(())
-        for torsion, has, logits in self.of_windows(observed, states, places, counts, times_ps, apart_ps, kept):
-            chosen = states[:, 1:, has, torsion]
-            each = F.cross_entropy(logits.flatten(0, -2), chosen.flatten(), reduction="none").reshape(chosen.shape)
-            total = total + (each if share is None else share[:, None, has, torsion] * each).sum()
-        return total / (times_ps.numel() * max(1, int((counts > 0).sum())))
-
-    def of_windows(
-        self, observed: Tensor, states: Tensor, places: Tensor, counts: Tensor, times_ps: Tensor, apart_ps: Tensor,
-        kept: Tensor | float = 1.0,
-    ) -> Iterator[tuple[int, Tensor, Tensor]]:  # fmt: skip
-        """Yield each torsion, the residues `(n,)` that have it, and the logits `(b, t, n, MOST_STATES)` of its new
-        states in windows as `loss` takes them."""
-        with torch.autocast(observed.device.type, enabled=False):
-            before, new = states[:, :-1], states[:, 1:]
-            earlier = torch.cat([before[:, :1], before[:, :-1]], dim=1)
-            of_times, levels = self.of_times_alone(times_ps, apart_ps, places, counts)
-            h = self.of_frames(conditioning_states(before, counts), conditioning_states(earlier, counts))
-            h = h + of_times[:, :, None] + self.of_observed(observed, states[:, 0], places, counts)[:, None]
-            conditioning = conditioning_states(new, counts)
-            h = kept * (h + self.of_new_states(conditioning))
-            for torsion in torch.nonzero((counts > 0).any(0))[:, 0].tolist():
-                has = torch.nonzero(counts[:, torsion])[:, 0]
-                earlier_torsions = conditioning[..., : torsion * MOST_STATES].index_select(2, has)
-                own = h.index_select(2, has), levels.index_select(3, has), before[..., has, torsion], earlier_torsions
-                yield torsion, has, self.probabilities(torsion, *own)
-
-    def draw(
-        self, observed: Tensor, states: Tensor, places: Tensor, counts: Tensor, times_ps: Tensor, apart_ps: Tensor,
-        uniform: Tensor, shares: Tensor | None = None,
-    ) -> Tensor:  # fmt: skip
-        """Return states `(b, t, r, MOST_TORSIONS)` of new frames, from the given frame's numbers and `states`
-        (b, r, MOST_TORSIONS) and numbers `uniform` (b, t, r, MOST_TORSIONS) in [0, 1). Their probabilities are written
-        to `shares` (b, t, r, MOST_TORSIONS, MOST_STATES)."""
-        with torch.autocast(observed.device.type, enabled=False):
-            of_times, levels = self.of_times_alone(times_ps, apart_ps, places, counts)
-            common = self.of_observed(observed, states, places, counts)[:, None] + of_times[:, :, None]
-            # A residue's torsion in each state, as `conditioning_states` has it.
-            ones = torch.eye(MOST_STATES, device=observed.device) * (counts > 0)[..., None, None]
-            residues, most = torch.arange(len(counts), device=observed.device), (counts - 1).clamp(min=0)
-            turns = [(part, torch.nonzero((counts[part] > 0).any(0))[:, 0].tolist()) for part in self.turns]
-            now, found = states[:, None], []
-            before = conditioning = conditioning_states(now, counts)
-            for k in range(times_ps.shape[1]):
-                at = slice(k, k + 1)
-                h = self.of_frames(conditioning, before) + common[:, at]
-                new, before, conditioning = torch.zeros_like(now), conditioning, torch.zeros_like(conditioning)
-                for turn, (part, torsions) in enumerate(turns):
-                    seen = (h + self.of_new_states(conditioning) if turn else h)[..., part, :]
-                    for torsion in torsions:
-                        logits = self.probabilities(
-                            torsion, seen, levels[:, at, :, part], now[..., part, torsion], conditioning[..., part, :]
-                        )
-                        share = logits.softmax(-1)
-                        if shares is not None:
-                            shares[:, at, part, torsion] = share
-                        share = share.cumsum(-1)
-                        # Shares may end below one by rounding.
-                        drawn = (uniform[:, at, part, torsion, None] >= share[..., :-1]).sum(-1)
-                        new[..., part, torsion] = drawn.minimum(most[part, torsion])
-                        own = slice(torsion * MOST_STATES, (torsion + 1) * MOST_STATES)
-                        conditioning[..., part, own] = ones[residues[part], torsion, new[..., part, torsion]]
-                found.append(new)
-                now = new
-            return torch.cat(found, dim=1)
 
 
 def times_apart(times_ps: Tensor, forgotten_ps: float) -> Tensor:
     """Return the time `(b, t)` between each frame and the one before it; frames of endless times know none before."""
     before = torch.cat([torch.zeros_like(times_ps[:, :1]), times_ps[:, :-1]], dim=1)
     return torch.where(times_ps >= forgotten_ps, times_ps, times_ps - before)
-
-
-def distances_along(n: int, device: torch.device) -> Tensor:
-    """Return how far `n` residues are apart along the chain, as numbers from 0 to 2 * _FAR, `(n, n)`."""
-    place = torch.arange(n, device=device)
-    return (place[:, None] - place).clamp(-_FAR, _FAR) + _FAR
-
-
-def _beside(x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Return of residues `(..., r, n)` each itself, the one before it and the one after it."""
-    none = torch.zeros_like(x[..., :1, :])
-    return x, torch.cat([none, x[..., :-1, :]], -2), torch.cat([x[..., 1:, :], none], -2)
 
 
 # More random numbers than a chunk's noise holds: pairs of numbers of its first frame, which nothing else uses, seed
@@ -269,6 +53,10 @@ def generators(noise: Tensor, place: int, attempt: int = 0) -> list[torch.Genera
 
 _MOST_CORRELATED = 0.995
 _LONGEST_WAVE = 4.0
+# As many times as many frames make a chunk where each is drawn on its own.
+_FAR_APART = 4
+# Frames that states at endless times are the mean after, and in how many draws these forget where they began.
+_ENDLESS_FRAMES, _ENDLESS_TIMES = 16, 4
 # Chunks that disobey the states that were drawn for them, or whose atoms overlap, are drawn again so often.
 MAX_REDRAWS = 8
 # Where atoms overlap so many times, there may be no room for them in these states, and these are drawn again, too.
@@ -314,7 +102,7 @@ class PeptideLayer(nn.Module):
         super().__init__()
         self.spatial = ParallelBlock(width, n_heads)
         self.temporal = ParallelBlock(width, n_heads)
-        self.of_distance = nn.Embedding(2 * _FAR + 1, n_heads)
+        self.of_distance = nn.Embedding(2 * FAR + 1, n_heads)
 
     def forward(self, h: Tensor, modulation: Tensor, rope: tuple[Tensor, Tensor], bias: Tensor) -> Tensor:
         """`h` (b, r, t, width); `bias` (n_heads, r, r): of scores, by how far apart residues are (`of_distance`)."""
@@ -427,6 +215,7 @@ class PeptideSlide(Propagator):
         self.token_mean = nn.Buffer(torch.zeros(n_kinds, MOST_STATES, n_slots))
         self.token_scale = nn.Buffer(torch.ones(n_kinds, n_slots))
         self.correlation = nn.Buffer(torch.zeros(n_kinds, len(config.lags_ps), n_slots))
+        self._endless: tuple[ChainFeatures, Endless] | None = None
 
     def featurise(self, scene: Scene) -> Molecule:
         """See `Propagator.featurise`; `own`: the chain's `ChainFeatures`. Raises InputError for a scene that is no
@@ -436,7 +225,18 @@ class PeptideSlide(Propagator):
     @property
     def n_new(self) -> int:
         assert self.lag_ps is not None
-        return max(1, min(self.config.chunk_frames, int(self.config.longest_ps / self.lag_ps * (1 + 1e-6))))
+        most, within = self.config.chunk_frames, int(self.config.longest_ps / self.lag_ps * (1 + 1e-6))
+        return _FAR_APART * most if self.far_apart(self.lag_ps) else max(1, min(most, within))
+
+    def far_apart(self, lag_ps: float) -> bool:
+        """Whether only one frame fits the longest time of training. Then all of a chunk count as the first after the
+        given frame, whose numbers say next to nothing of them, and their states follow from those of the frame before
+        alone."""
+        return 2.0 * lag_ps > self.config.longest_ps * (1 + 1e-6)
+
+    def keeps_populations(self, lag_ps: float) -> bool:
+        in_first = self.solvent in (None, *self.config.solvents[:1])
+        return super().keeps_populations(lag_ps) or (in_first and self.far_apart(lag_ps))
 
     def normalised(self, frames_nm: Tensor, chain: ChainFeatures) -> tuple[Tensor, Tensor]:
         """Frames `(..., n_atoms, 3)` nm -> numbers `(..., n_residues, n_slots)`, zero in empty places, and the states
@@ -518,6 +318,22 @@ class PeptideSlide(Propagator):
         y = flow.SOLVERS[solver](predict, drawn, solver_steps)
         return self._tokens(self.from_innovations(y, observed, times_ps, self.kinds(chain)), states, chain), evaluations
 
+    def endless(self, chain: ChainFeatures) -> Endless | None:
+        """Return the states at endless times that frames far apart keep; None in other solvents than the first, where
+        populations are set in steps alone."""
+        if chain.solvent:
+            return None
+        if self._endless is None or self._endless[0] is not chain:
+            generator, counts = torch.Generator().manual_seed(0), chain.stated.counts
+            states = counts.new_zeros(_ENDLESS_FRAMES, *counts.shape)
+            time = torch.full((len(states), 1), self.config.forgotten_ps, device=counts.device)
+            none = time.new_zeros(*states.shape[:2], chain.code.n_slots)
+            for _ in range(_ENDLESS_TIMES):
+                uniform = torch.rand(len(states), 1, *counts.shape, generator=generator).to(time)
+                states = self.jumps.draw(none, states, chain.places, counts, time, time, uniform)[:, 0]
+            self._endless = chain, Endless(states, self.config.forgotten_ps)
+        return self._endless[1]
+
     def noise_shape(self, n_atoms: int) -> tuple[int, ...]:
         # At least as many numbers as a frame has coordinates that vary.
         return (self.n_new, n_atoms, 4)
@@ -531,46 +347,57 @@ class PeptideSlide(Propagator):
         if solver in flow.ADAPTIVE and len(noise) > 1:
             draw = partial(self.next_chunk, solver_steps=solver_steps, solver=solver)
             return row_by_row(lambda x, own: draw(x, molecule, own), last_frames_nm, noise)
-        filled = chain.code.filled
+        filled, counts = chain.code.filled, chain.stated.counts
         observed, now = self.normalised(last_frames_nm[:, -1], chain)
-        assert self.lag_ps is not None
-        ahead = self.lag_ps * torch.arange(1, self.n_new + 1, device=observed.device)
-        times = ahead.expand(len(observed), -1).float()
+        lag_ps = self.lag_ps
+        assert lag_ps is not None
+        n_new, far_apart, device = self.n_new, self.far_apart(lag_ps), observed.device
+        ahead = torch.ones(n_new) if far_apart else torch.arange(1, n_new + 1)
+        times = (lag_ps * ahead.to(observed)).expand(len(observed), -1)
+        apart = times_apart(times, self.config.forgotten_ps)
         drawn = observed.new_zeros(*noise.shape[:2], *filled.shape)
         drawn[..., filled] = noise.flatten(2)[..., : int(filled.sum())].to(observed)
-        counts, apart = chain.stated.counts, times_apart(times, self.config.forgotten_ps)
-        shape, jumps = (self.n_new, *counts.shape), self.jumps_of(chain)
+        jumps = self.jumps_of(chain)
+        known = (chain.places, counts)
 
-        def draw_states(rows: Tensor, attempt: int) -> Tensor:
+        def draw_states(rows: Tensor, before: Tensor, attempt: int) -> Tensor:
             seeds = generators(noise[rows], STATES, attempt)
-            uniform = torch.stack([torch.rand(shape, generator=g) for g in seeds]).to(observed)
-            return jumps.draw(observed[rows], now[rows], chain.places, counts, times[rows], apart[rows], uniform)
+            if far_apart:
+                uniform = torch.stack([torch.rand(n_new, counts.numel() + 1, generator=g) for g in seeds]).to(observed)
+                return jumps.draw_apart(before, *known, lag_ps, uniform, self.endless(chain))
+            uniform = torch.stack([torch.rand(n_new, *counts.shape, generator=g) for g in seeds]).to(observed)
+            return jumps.draw(observed[rows], before, *known, times[rows], apart[rows], uniform)
 
-        rows = torch.arange(len(observed), device=observed.device)
-        states = draw_states(rows, 0)
+        states = draw_states(torch.arange(len(observed)), now, 0)
+        frames = observed.new_empty(*times.shape, *last_frames_nm.shape[-2:])
+        # What is yet to be drawn, and where atoms overlapped.
+        todo, crowded = torch.ones_like(times, dtype=torch.bool), torch.zeros_like(times, dtype=torch.bool)
         evaluations = 0.0
-
-        def solve(rows: Tensor, drawn: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-            """Return frames, and in which rows some disobey their states and some overlap, all that could be done."""
-            nonlocal evaluations
-            given = observed[rows], now[rows], states[rows], times[rows]
-            tokens, n = self.solved(*given, chain, drawn, solver=solver, solver_steps=solver_steps)
-            evaluations += n * len(rows) / len(observed)
-            resolved = mended(tokens.flatten(0, 1), states[rows].flatten(0, 1), chain)
-            frames, astray, crowded = (x.unflatten(0, tokens.shape[:2]) for x in resolved)
-            return self._laid(frames, chain), astray.any(-1), crowded.any(-1)
-
-        frames, astray, crowded = solve(rows, drawn)
-        for attempt in range(MAX_REDRAWS):
-            wrong = astray | crowded
-            rows, overlap = rows[wrong], crowded[wrong]
+        for attempt in range(-1, MAX_REDRAWS):
+            if attempt >= _OVERLAPS:
+                for row in torch.nonzero((todo & crowded).any(1)).flatten().tolist():
+                    first = int(crowded[row].int().argmax()) if far_apart else 0
+                    own, before = torch.tensor([row]), states[row, first - 1] if first else now[row]
+                    states[row, first:] = draw_states(own, before[None], attempt)[0, : n_new - first]
+                    todo[row, first:] = True
+            rows = torch.nonzero(todo.any(1))[:, 0]
             if not len(rows):
                 break
-            if attempt >= _OVERLAPS and overlap.any():
-                states[rows[overlap]] = draw_states(rows[overlap], attempt)
-            again = drawn.new_zeros(len(rows), *drawn.shape[1:])
-            seeds = generators(noise[rows], REDRAWS, attempt)
-            fresh = (*drawn.shape[1:2], int(filled.sum()))
-            again[..., filled] = torch.stack([torch.randn(fresh, generator=g) for g in seeds]).to(again)
-            frames[rows], astray, crowded = solve(rows, again)
+            if attempt >= 0:
+                seeds, fresh = generators(noise[rows], REDRAWS, attempt), (n_new, int(filled.sum()))
+                again = drawn[rows]
+                again[..., filled] = torch.stack([torch.randn(fresh, generator=g) for g in seeds]).to(again)
+                drawn[rows] = torch.where(todo[rows][..., None, None], again, drawn[rows])
+            # Frames far apart are drawn each on its own, else chunks.
+            whole = rows[:, None], torch.arange(n_new, device=device)[None]
+            row, _ = at = torch.nonzero(todo)[..., None].unbind(1) if far_apart else whole
+            tokens, n = self.solved(
+                observed[row[:, 0]], now[row[:, 0]], states[at], times[at], chain, drawn[at],
+                solver=solver, solver_steps=solver_steps,
+            )  # fmt: skip
+            evaluations += n * len(row) * tokens.shape[1] / todo.numel()
+            resolved = mended(tokens.flatten(0, 1), states[at].flatten(0, 1), chain)
+            placed, astray, crowded[at] = (x.unflatten(0, tokens.shape[:2]) for x in resolved)
+            frames[at] = self._laid(placed, chain)
+            todo[at] = (astray | crowded[at]).any(1, keepdim=True)
         return Chunk(frames, evaluations=evaluations)

@@ -87,6 +87,9 @@ def test_the_lag_follows_from_what_is_kept(weights: Weights, monkeypatch: pytest
     assert choose_lag(weights, 2.5, 50.0) == 2.5
     monkeypatch.setattr(weights.model, "usual_lag_ps", 10.0)
     assert choose_lag(weights, None, 60.0) == 10.0 and choose_lag(weights, 20.0, 60.0) == 20.0
+    # Longer steps that keep populations are taken where the save interval is a multiple of them.
+    monkeypatch.setattr(weights.model, "keeps_populations", lambda lag_ps: lag_ps <= 10.0 or lag_ps > 15.0)
+    assert choose_lag(weights, None, 60.0) == 20.0 and choose_lag(weights, None, 30.0) == 10.0
 
 
 @pytest.mark.parametrize(("lag_ps", "save_every_ps"), [(0.5, None), (21.0, None), (None, 0.5)])

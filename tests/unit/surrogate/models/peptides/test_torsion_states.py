@@ -28,7 +28,8 @@ from surrogate.models.peptides.chains import (
     mirrored,
 )
 from surrogate.models.peptides.layout import PeptideConfig, chain_features, chain_layout, chain_scale
-from surrogate.models.peptides.model import PeptideSlide, StateJumps, times_apart
+from surrogate.models.peptides.model import PeptideSlide, times_apart
+from surrogate.models.peptides.state_jumps import StateJumps
 from surrogate.models.peptides.trainer import state_loss
 from systems.chemistry.geometry import torsion
 from systems.prepare.peptide import build_peptide
@@ -283,8 +284,8 @@ def test_states_in_which_atoms_always_overlap_are_drawn_again(monkeypatch: pytes
         monkeypatch.setattr(module, "_OVERLAPS", module.MAX_REDRAWS)
     scene = build_peptide("ACE-ALA-NME")
     torch.manual_seed(0)
-    model = PeptideSlide(_config(scene)).eval().requires_grad_(False)
-    model.lag_ps = 1000.0
+    model = PeptideSlide(replace(_config(scene), chunk_frames=1)).eval().requires_grad_(False)
+    model.lag_ps = 100.0
     molecule = model.featurise(scene)
     chain = molecule.own
     assert chain is not None
@@ -306,8 +307,10 @@ def test_each_solvent_has_probabilities_of_its_own() -> None:
     """Psi changes as often as not in water, and never in OBC2."""
     scene = build_peptide("ACE-ALA-NME")
     torch.manual_seed(0)
-    model = PeptideSlide(replace(_config(scene), solvents=("obc2", "tip3p"))).eval().requires_grad_(False)
-    model.lag_ps = 1000.0
+    model = (
+        PeptideSlide(replace(_config(scene), chunk_frames=1, solvents=("obc2", "tip3p"))).eval().requires_grad_(False)
+    )
+    model.lag_ps = 100.0
     for jumps in model.all_jumps:
         jumps.logits.bias[:] = -30.0
     model.jumps_elsewhere[0].of_change[0, :, 1] = 30.0

@@ -1,0 +1,393 @@
+"""The probabilities that torsions change their states, and states drawn by them.
+
+Which state each torsion with barriers is in is drawn before the flow draws the frames that go with it: a flow that
+draws barrier crossings along with everything else leaks between states, and a categorical draw does not. A frame's
+states are drawn one after the other, by a C++ program (`state_jumps.cpp`), else by torch.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import math
+from collections.abc import Callable, Iterator
+from functools import cache
+from pathlib import Path
+from typing import NamedTuple, cast
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from surrogate.models.layers import ParallelBlock
+from surrogate.models.peptides.chains import MOST_STATES, MOST_TORSIONS, conditioning_states
+from systems.files.native import CompilerError, compiled_program
+
+_WIDTH = 96
+_WAVES = 8
+# Before training, a torsion changes to another state once in so many frames (in logits).
+_RARELY = -5.0
+# A step of training moves the probabilities by so many times as much as another parameter.
+_FAST = 10.0
+# Residues further apart along the chain are alike far.
+FAR = 6
+_COUPLED_BLOCKS, _COUPLED_HEADS = 2, 4
+
+
+class Endless(NamedTuple):
+    """The states of a molecule long after any frame: as likely as `time_ps` after frames in states `given` (n,
+    n_residues, MOST_TORSIONS)."""
+
+    given: Tensor
+    time_ps: float
+
+
+class StateJumps(nn.Module):
+    """The probabilities that torsions change their states between a frame and the next.
+
+    They follow from the residue's type, its numbers in the given frame, its and its two neighbours' states in that and
+    in the frame before, its own in the one before that, the new states of its torsions before this one, and both times.
+    Of neighbours' types only levels are learned, which add up: else the network would know each pair of training.
+
+    `coupled`, for trainings on many more sequences: neighbours' types count in full, attention over residues mixes what
+    the given frame tells, and every other residue sees the new states of those beside it, which are drawn first.
+    """
+
+    def __init__(self, n_slots: int, n_types: int, *, coupled: bool = False) -> None:
+        super().__init__()
+        self.coupled = coupled
+        n_states = MOST_TORSIONS * MOST_STATES
+        self.of_numbers = nn.Linear(n_slots, _WIDTH, bias=False)
+        self.of_given = nn.ModuleList(nn.Linear(n_states, _WIDTH, bias=False) for _ in range(3))
+        self.of_before = nn.ModuleList(nn.Linear(n_states, _WIDTH, bias=False) for _ in range(3))
+        self.of_earlier = nn.Linear(n_states, _WIDTH, bias=False)
+        self.of_type = nn.Embedding(n_types, _WIDTH)
+        self.waves = nn.Buffer(math.pi * torch.linspace(0.25, 2.0, _WAVES), persistent=False)
+        self.of_times = nn.Linear(4 * _WAVES + 2, _WIDTH)
+        self.of_new = nn.ModuleList(nn.Linear(n_states, _WIDTH, bias=False) for _ in range(MOST_TORSIONS))
+        self.of_torsion = nn.Embedding(MOST_TORSIONS, _WIDTH)
+        self.hidden = nn.Linear(_WIDTH, _WIDTH)
+        self.logits = nn.Linear(_WIDTH, MOST_STATES)
+        # Of each type and torsion, from one state to another: a level, and a slope with the logarithm of time.
+        self.of_change = nn.Parameter(torch.zeros(2, n_types, MOST_TORSIONS, MOST_STATES, MOST_STATES))
+        # And a level of the residue before's type, and of the one after's: proline forbids what others allow.
+        self.beside_change = nn.Parameter(torch.zeros(2, n_types, MOST_TORSIONS, MOST_STATES, MOST_STATES))
+        nn.init.zeros_(self.logits.weight)
+        nn.init.constant_(self.logits.bias, _RARELY)
+        if coupled:
+            self.of_type_beside = nn.ModuleList(nn.Embedding(n_types, _WIDTH) for _ in range(2))
+            self.blocks = nn.ModuleList(ParallelBlock(_WIDTH, _COUPLED_HEADS) for _ in range(_COUPLED_BLOCKS))
+            self.of_distance = nn.Embedding(2 * FAR + 1, _COUPLED_HEADS)
+            self.of_new_beside = nn.ModuleList(nn.Linear(n_states, _WIDTH, bias=False) for _ in range(2))
+            # Weights that are gone on from begin as they were.
+            for part in (*self.of_type_beside, *self.of_new_beside):
+                nn.init.zeros_(cast(nn.Embedding | nn.Linear, part).weight)
+
+    @property
+    def turns(self) -> tuple[slice, ...]:
+        """The residues whose new states are drawn at once, one part after the other."""
+        return (slice(0, None, 2), slice(1, None, 2)) if self.coupled else (slice(None),)
+
+    def of_observed(self, observed: Tensor, states: Tensor, places: Tensor, counts: Tensor) -> Tensor:
+        """What all frames of a chunk have in common: `observed` (b, r, slots), its `states` (b, r, MOST_TORSIONS),
+        `places` (r, 4) -> (b, r, width)."""
+        beside = _beside(conditioning_states(states, counts))
+        h: Tensor = sum((of(x) for of, x in zip(self.of_given, beside, strict=True)), self.of_numbers(observed.float()))
+        of_types, bias = self.of_types(places)
+        h = h + of_types
+        if bias is not None:
+            still = h.new_zeros(len(h), 3, _WIDTH)
+            for block in self.blocks:
+                h = block(h[:, None], still, None, bias=bias)[0][:, 0]
+        return h
+
+    def of_types(self, places: Tensor) -> tuple[Tensor, Tensor | None]:
+        """What types tell `(r, width)`, and the scores of `blocks` (heads, r, r) by how far residues are apart."""
+        of_types: Tensor = self.of_type(places[:, 0])
+        if not self.coupled:
+            return of_types, None
+        beside = sum(of(places[:, 1 + k]) for k, of in enumerate(self.of_type_beside))
+        return of_types + beside, self.of_distance(distances_along(len(places), places.device)).permute(2, 0, 1)
+
+    def of_new_states(self, conditioning: Tensor) -> Tensor | float:
+        """What every other residue sees of the new states beside it: `conditioning` (b, t, r, n) of the new frame ->
+        (b, t, r, width), zero for the residues of the first turn."""
+        if not self.coupled:
+            return 0.0
+        found: Tensor = sum(
+            (of(x) for of, x in zip(self.of_new_beside, _beside(conditioning)[1:], strict=True)),
+            conditioning.new_zeros(()),
+        )
+        return found * (torch.arange(found.shape[-2], device=found.device) % 2)[:, None]
+
+    def of_times_alone(
+        self, times_ps: Tensor, apart_ps: Tensor, places: Tensor, counts: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """Return what follows from frames' `times_ps` and `apart_ps` (b, t), after the given frame and after the one
+        before: `(b, t, width)`, and the levels of the probabilities `(b, t, MOST_TORSIONS, r, from, to)`."""
+        logs = torch.stack([times_ps, apart_ps], dim=-1).float().clamp(min=1e-3).log10()
+        angles = logs[..., None] * self.waves
+        waves = torch.cat([angles.sin(), angles.cos()], dim=-1).flatten(-2)
+        level, slope = (change[places[:, 0]].transpose(0, 1) for change in self.of_change)
+        for which, change in enumerate(self.beside_change):
+            level = level + _FAST * change[places[:, 1 + which]].transpose(0, 1)
+        absent = torch.arange(MOST_STATES, device=counts.device) >= counts.T[..., None, None].clamp(min=1)
+        levels = (level + slope * logs[..., 1, None, None, None, None]).masked_fill(absent, -torch.inf)
+        return self.of_times(torch.cat([waves, logs], dim=-1)), levels
+
+    def of_frames(self, conditioning: Tensor, earlier: Tensor) -> Tensor:
+        """`conditioning_states` of the frame before each, (b, t, r, n), and of the one before that, `earlier` -> (b, t,
+        r, width)."""
+        of_all = torch.cat([of.weight for of in (*self.of_before, self.of_earlier)], dim=1)
+        return F.linear(torch.cat([*_beside(conditioning), earlier], dim=-1), of_all)
+
+    def probabilities(self, torsion: int, h: Tensor, levels: Tensor, now: Tensor, conditioning: Tensor) -> Tensor:
+        """Return the logits `(b, t, r, MOST_STATES)` of the new state of one torsion of each residue.
+
+        `h` (b, t, r, width) is what `of_observed`, `of_times_alone` and `of_frames` add up to, `levels` what
+        `of_times_alone` returns; `now` (b, t, r) the torsion's state in the frame before, `conditioning` (b, t, r, n)
+        the `conditioning_states` of the new frame, of which torsions before this one count.
+        """
+        n = torsion * MOST_STATES
+        of_new = cast(nn.Linear, self.of_new[torsion]).weight
+        h = F.silu(h + F.linear(conditioning[..., :n], of_new[:, :n], self.of_torsion.weight[torsion]))
+        at = now[..., None, None].expand(*now.shape, 1, MOST_STATES)
+        level = levels[:, :, torsion].expand(*now.shape, -1, -1).gather(-2, at)[..., 0, :]
+        # To stay has the logit zero.
+        return (self.logits(F.silu(self.hidden(h))) + level).scatter(-1, now[..., None], 0.0)
+
+    @torch.no_grad()
+    def raise_change(self, torsion: int, start: int, end: int, levels: Tensor) -> None:
+        """Add `levels` (3, n_types) to the logits of one change, of the residue's type, of that before and of that
+        after."""
+        self.of_change[0, :, torsion, start, end] += levels[0]
+        self.beside_change[:, :, torsion, start, end] += levels[1:] / _FAST
+
+    def loss(
+        self, observed: Tensor, states: Tensor, places: Tensor, counts: Tensor, times_ps: Tensor, apart_ps: Tensor,
+        share: Tensor | None = None, kept: Tensor | float = 1.0,
+    ) -> Tensor:  # fmt: skip
+        """Return the negative log-likelihood of what torsions did, per frame and torsion.
+
+        `observed` (b, r, slots); `states` (b, 1 + t, r, MOST_TORSIONS), the given frame's first; `share` (b, r,
+        MOST_TORSIONS): what each torsion's change counts in a window, 1 where it is not given; `kept` (b, 1, r, width):
+        factors of hidden numbers.
+        """
+        total = observed.new_zeros(())
+        for torsion, has, logits in self.of_windows(observed, states, places, counts, times_ps, apart_ps, kept):
+            chosen = states[:, 1:, has, torsion]
+            each = F.cross_entropy(logits.flatten(0, -2), chosen.flatten(), reduction="none").reshape(chosen.shape)
+            total = total + (each if share is None else share[:, None, has, torsion] * each).sum()
+        return total / (times_ps.numel() * max(1, int((counts > 0).sum())))
+
+    def of_windows(
+        self, observed: Tensor, states: Tensor, places: Tensor, counts: Tensor, times_ps: Tensor, apart_ps: Tensor,
+        kept: Tensor | float = 1.0,
+    ) -> Iterator[tuple[int, Tensor, Tensor]]:  # fmt: skip
+        """Yield each torsion, the residues `(n,)` that have it, and the logits `(b, t, n, MOST_STATES)` of its new
+        states in windows as `loss` takes them."""
+        with torch.autocast(observed.device.type, enabled=False):
+            before, new = states[:, :-1], states[:, 1:]
+            earlier = torch.cat([before[:, :1], before[:, :-1]], dim=1)
+            of_times, levels = self.of_times_alone(times_ps, apart_ps, places, counts)
+            h = self.of_frames(conditioning_states(before, counts), conditioning_states(earlier, counts))
+            h = h + of_times[:, :, None] + self.of_observed(observed, states[:, 0], places, counts)[:, None]
+            conditioning = conditioning_states(new, counts)
+            h = kept * (h + self.of_new_states(conditioning))
+            for torsion in torch.nonzero((counts > 0).any(0))[:, 0].tolist():
+                has = torch.nonzero(counts[:, torsion])[:, 0]
+                earlier_torsions = conditioning[..., : torsion * MOST_STATES].index_select(2, has)
+                own = h.index_select(2, has), levels.index_select(3, has), before[..., has, torsion], earlier_torsions
+                yield torsion, has, self.probabilities(torsion, *own)
+
+    def draw(
+        self, observed: Tensor, states: Tensor, places: Tensor, counts: Tensor, times_ps: Tensor, apart_ps: Tensor,
+        uniform: Tensor, shares: Tensor | None = None,
+    ) -> Tensor:  # fmt: skip
+        """Return states `(b, t, r, MOST_TORSIONS)` of new frames, from the given frame's numbers and `states`
+        (b, r, MOST_TORSIONS) and numbers `uniform` (b, t, r, MOST_TORSIONS) in [0, 1). Their probabilities are written
+        to `shares` (b, t, r, MOST_TORSIONS, MOST_STATES)."""
+        with torch.autocast(observed.device.type, enabled=False):
+            of_times, levels = self.of_times_alone(times_ps, apart_ps, places, counts)
+            common = self.of_observed(observed, states, places, counts)[:, None] + of_times[:, :, None]
+            program = _program() if shares is None and observed.device.type == "cpu" else None
+            if program is not None:
+                call = _Call(self, places, counts)
+                return call(program.draw, states, uniform, common, levels)
+            # A residue's torsion in each state, as `conditioning_states` has it.
+            ones = torch.eye(MOST_STATES, device=counts.device) * (counts > 0)[..., None, None]
+            residues, most = torch.arange(len(counts), device=counts.device), (counts - 1).clamp(min=0)
+            turns = [(part, torch.nonzero((counts[part] > 0).any(0))[:, 0].tolist()) for part in self.turns]
+            now, found = states[:, None], []
+            before = conditioning = conditioning_states(now, counts)
+            for k in range(times_ps.shape[1]):
+                at = slice(k, k + 1)
+                h = self.of_frames(conditioning, before) + common[:, at]
+                new, before, conditioning = torch.zeros_like(now), conditioning, torch.zeros_like(conditioning)
+                for turn, (part, torsions) in enumerate(turns):
+                    seen = (h + self.of_new_states(conditioning) if turn else h)[..., part, :]
+                    for torsion in torsions:
+                        logits = self.probabilities(
+                            torsion, seen, levels[:, at, :, part], now[..., part, torsion], conditioning[..., part, :]
+                        )
+                        share = logits.softmax(-1)
+                        if shares is not None:
+                            shares[:, at, part, torsion] = share
+                        share = share.cumsum(-1)
+                        # Shares may end below one by rounding.
+                        drawn = (uniform[:, at, part, torsion, None] >= share[..., :-1]).sum(-1)
+                        new[..., part, torsion] = drawn.minimum(most[part, torsion])
+                        own = slice(torsion * MOST_STATES, (torsion + 1) * MOST_STATES)
+                        conditioning[..., part, own] = ones[residues[part], torsion, new[..., part, torsion]]
+                found.append(new)
+                now = new
+            return torch.cat(found, dim=1)
+
+    def draw_apart(
+        self, states: Tensor, places: Tensor, counts: Tensor, time_ps: float, uniform: Tensor,
+        endless: Endless | None,
+    ) -> Tensor:  # fmt: skip
+        """Return states `(b, t, r, MOST_TORSIONS)` of frames `time_ps` apart, each of which follows from the states of
+        the one before alone; the first from `states` (b, r, MOST_TORSIONS). With `endless` what the probabilities
+        propose is accepted by the rule of Metropolis and Hastings (Biometrika 57, 97 (1970)), so that states are as
+        likely as at endless times. `uniform` (b, t, r * MOST_TORSIONS + 1), in [0, 1): the last for acceptance."""
+        program = _program() if states.device.type == "cpu" else None
+        if program is not None:
+            call, (time, levels) = _Call(self, places, counts), self._at(time_ps, places, counts)
+            known = _Endless() if endless is None else self._c_endless(call, endless)
+            return call(program.draw_apart, states, uniform, time, levels, known)
+        propose, last = uniform[..., :-1].unflatten(-1, counts.shape), uniform[..., -1].double()
+        time, none = states.new_full((len(states), 1), time_ps, dtype=torch.float32), self._no_numbers(states)
+        now, found = states, []
+        for k in range(uniform.shape[1]):
+            new = self.draw(none, now, places, counts, time, time, propose[:, k : k + 1])[:, 0]
+            if endless is not None:
+                there, back = ((a, b, places, counts, time_ps) for a, b in ((now, new), (new, now)))
+                ratio = self.log_probability(*back) - self.log_probability(*there)
+                ratio += self._log_share(new, places, counts, endless) - self._log_share(now, places, counts, endless)
+                new = torch.where((last[:, k] < ratio.exp())[:, None, None], new, now)
+            now = new
+            found.append(now)
+        return torch.stack(found, dim=1)
+
+    def log_probability(self, before: Tensor, after: Tensor, places: Tensor, counts: Tensor, time_ps: float) -> Tensor:
+        """Return the logarithm of how likely states `after` (b, r, MOST_TORSIONS) are `time_ps` after a frame in states
+        `before` whose numbers are their means, `(b,)`."""
+        time = before.new_full((len(before), 1), time_ps, dtype=torch.float32)
+        windows = self._no_numbers(before), torch.stack([before, after], dim=1), places, counts, time, time
+        found = before.new_zeros(len(before), dtype=torch.float64)
+        for torsion, has, logits in self.of_windows(*windows):
+            found += logits.double().log_softmax(-1).gather(-1, after[:, None, has, torsion, None]).sum((1, 2, 3))
+        return found
+
+    def _log_share(self, states: Tensor, places: Tensor, counts: Tensor, endless: Endless) -> Tensor:
+        """Return the logarithm of how likely states `(b, r, MOST_TORSIONS)` are at endless times, but for a
+        constant."""
+        each = [
+            self.log_probability(given.expand_as(states), states, places, counts, endless.time_ps)
+            for given in endless.given
+        ]
+        return torch.stack(each).logsumexp(0)
+
+    def _no_numbers(self, states: Tensor) -> Tensor:
+        return states.new_zeros(*states.shape[:2], self.of_numbers.in_features, dtype=torch.float32)
+
+    def _at(self, time_ps: float, places: Tensor, counts: Tensor) -> tuple[Tensor, Tensor]:
+        """Return what `of_times_alone` does of one time: `(width,)` and `(MOST_TORSIONS, r, from, to)`."""
+        time = torch.full((1, 1), time_ps)
+        of_times, levels = self.of_times_alone(time, time, places, counts)
+        return of_times[0, 0], levels[0, 0]
+
+    def _c_endless(self, call: _Call, endless: Endless) -> _Endless:
+        of_times, levels = self._at(endless.time_ps, call.places, call.counts)
+        before = conditioning_states(endless.given, call.counts)
+        h = self.of_observed(self._no_numbers(endless.given), endless.given, call.places, call.counts)
+        h = h + of_times + self.of_frames(before[:, None], before[:, None])[:, 0]
+        return _Endless(len(endless.given), *(call.at(x) for x in (endless.given, h, levels)))
+
+
+# The program, and what it takes, as `state_jumps.cpp` declares it.
+
+
+class _Linear(ctypes.Structure):
+    _fields_ = [("weight", ctypes.c_void_p), ("bias", ctypes.c_void_p)]
+
+
+class _Block(ctypes.Structure):
+    _fields_ = [("offset", ctypes.c_void_p), *((name, _Linear) for name in ("proj_in", "attention_out", "mlp_out"))]
+
+
+class _Net(ctypes.Structure):
+    _fields_ = [
+        ("n_residues", ctypes.c_int64), ("coupled", ctypes.c_int64), ("counts", ctypes.c_void_p),
+        ("given", 3 * _Linear), ("before", 3 * _Linear), ("earlier", _Linear), ("beside", 2 * _Linear),
+        ("fresh", MOST_TORSIONS * _Linear), ("hidden", _Linear), ("logits", _Linear),
+        *((name, ctypes.c_void_p) for name in ("torsion", "types", "distances")), ("blocks", _COUPLED_BLOCKS * _Block),
+    ]  # fmt: skip
+
+
+class _Endless(ctypes.Structure):
+    _fields_ = [("n", ctypes.c_int64), *((name, ctypes.c_void_p) for name in ("given", "h", "levels"))]
+
+
+@cache
+def _program() -> ctypes.CDLL | None:
+    """Return the program; None where it cannot be compiled."""
+    sizes = {"WIDTH": _WIDTH, "STATES": MOST_STATES, "TORSIONS": MOST_TORSIONS, "HEADS": _COUPLED_HEADS,
+             "BLOCKS": _COUPLED_BLOCKS}  # fmt: skip
+    try:
+        return compiled_program(Path(__file__).with_suffix(".cpp"), sizes)
+    except (CompilerError, OSError):
+        return None
+
+
+class _Call:
+    """A call of the program with the weights of `jumps` for residues at `places`, which it reads where they are."""
+
+    def __init__(self, jumps: StateJumps, places: Tensor, counts: Tensor) -> None:
+        self.places, self.counts, self._kept = places, counts, list[Tensor]()
+        of_types, distances = jumps.of_types(places)
+        net = self._net = _Net(len(places), jumps.coupled)
+        for name, several in (("given", jumps.of_given), ("before", jumps.of_before), ("fresh", jumps.of_new)):
+            getattr(net, name)[:] = [self._linear(layer) for layer in several]
+        net.earlier, net.hidden, net.logits = (self._linear(x) for x in (jumps.of_earlier, jumps.hidden, jumps.logits))
+        net.torsion, net.counts = self.at(jumps.of_torsion.weight), self.at(counts)
+        net.types = self.at(of_types)
+        if distances is not None:
+            net.distances = self.at(distances)
+            net.beside[:] = [self._linear(layer) for layer in jumps.of_new_beside]
+            for k, block in enumerate(cast(list[ParallelBlock], list(jumps.blocks))):
+                layers = block.proj_in, block.attention_out, block.mlp_out
+                net.blocks[k] = _Block(self.at(block.offset), *(self._linear(layer) for layer in layers))
+
+    def at(self, tensor: Tensor) -> int:
+        """Return where a tensor lies as long as this call does."""
+        self._kept.append(tensor.detach().contiguous())
+        return self._kept[-1].data_ptr()
+
+    def _linear(self, layer: nn.Module) -> _Linear:
+        bias = cast(Tensor | None, layer.bias)
+        return _Linear(self.at(cast(Tensor, layer.weight)), None if bias is None else self.at(bias))
+
+    def __call__(
+        self, function: Callable[..., None], states: Tensor, uniform: Tensor, common: Tensor, levels: Tensor,
+        endless: _Endless | None = None,
+    ) -> Tensor:  # fmt: skip
+        """Return states `(b, t, r, MOST_TORSIONS)` that a function of the program draws."""
+        found = states.new_empty(*uniform.shape[:2], *self.counts.shape)
+        first = [ctypes.byref(x) for x in (self._net, endless) if x is not None]
+        sizes = [ctypes.c_int64(n) for n in uniform.shape[:2]]
+        arrays = [ctypes.c_void_p(self.at(x)) for x in (common, levels, states, uniform)]
+        function(*first, *sizes, *arrays, ctypes.c_void_p(found.data_ptr()))
+        return found
+
+
+def distances_along(n: int, device: torch.device) -> Tensor:
+    """Return how far `n` residues are apart along the chain, as numbers from 0 to 2 * FAR, `(n, n)`."""
+    place = torch.arange(n, device=device)
+    return (place[:, None] - place).clamp(-FAR, FAR) + FAR
+
+
+def _beside(x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Return of residues `(..., r, n)` each itself, the one before it and the one after it."""
+    none = torch.zeros_like(x[..., :1, :])
+    return x, torch.cat([none, x[..., :-1, :]], -2), torch.cat([x[..., 1:, :], none], -2)

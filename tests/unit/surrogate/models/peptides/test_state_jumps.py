@@ -1,0 +1,154 @@
+"""States by the C++ program and by torch; frames so far apart that states alone tell of the next ones."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+import torch
+
+from surrogate.models.architecture import weights_path
+from surrogate.models.peptides import model as model_module
+from surrogate.models.peptides import state_jumps
+from surrogate.models.peptides.chains import MOST_STATES, MOST_TORSIONS, ChainFeatures, mended
+from surrogate.models.peptides.model import PeptideSlide
+from surrogate.models.peptides.state_jumps import Endless, StateJumps
+from surrogate.models.weights import load_weights
+from surrogate.sampling.domain import under_conditions
+from systems.prepare.peptide import build_peptide
+
+_PLACES = torch.tensor([[2, 0, 3], [3, 2, 2], [2, 3, 3], [3, 2, 1]])
+_COUNTS = torch.zeros(4, MOST_TORSIONS, dtype=torch.long)
+_COUNTS[0, 1], _COUNTS[1, :3], _COUNTS[2, :2], _COUNTS[3, [0, 1, 3]] = (
+    2,
+    torch.tensor([2, 2, 3]),
+    2,
+    torch.tensor([2, 2, 3]),
+)
+
+
+def _lively(*, coupled: bool) -> StateJumps:
+    """Probabilities that depend on all that they may."""
+    torch.manual_seed(0)
+    net = StateJumps(6, 4, coupled=coupled).requires_grad_(False)
+    for parameter in net.parameters():
+        parameter.add_(0.1 * torch.randn_like(parameter))
+    net.beside_change.mul_(0.1)
+    net.logits.bias.add_(4.5)
+    return net
+
+
+def _given(rows: int) -> torch.Tensor:
+    found = torch.randint(MOST_STATES, (rows, *_COUNTS.shape), generator=torch.Generator().manual_seed(1))
+    return found.minimum((_COUNTS - 1).clamp(min=0))
+
+
+def _by_torch(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(state_jumps, "_program", lambda: None)
+
+
+@pytest.mark.parametrize("coupled", [True, False])
+@pytest.mark.parametrize("size", [1.0, 1e4])
+def test_the_program_draws_what_torch_draws(monkeypatch: pytest.MonkeyPatch, coupled: bool, size: float) -> None:
+    if state_jumps._program() is None:
+        pytest.skip("no C++ compiler")
+    net, generator, rows = _lively(coupled=coupled), torch.Generator().manual_seed(2), 9
+    observed = size * torch.randn(rows, 4, 6, generator=generator)
+    ahead = torch.arange(1.0, 13.0)
+    times = torch.stack([x * ahead for x in torch.linspace(1.0, 80.0, rows)])
+    apart = times[:, :1].expand_as(times)
+    uniform = torch.rand(rows, 12, *_COUNTS.shape, generator=generator)
+    given = observed, _given(rows), _PLACES, _COUNTS, times, apart, uniform
+    endless = Endless(_given(5), 1e4)
+    far = _given(rows), _PLACES, _COUNTS, 1000.0, torch.rand(rows, 12, _COUNTS.numel() + 1, generator=generator)
+    ours = net.draw(*given), net.draw_apart(*far, endless), net.draw_apart(*far, None)
+    _by_torch(monkeypatch)
+    theirs = net.draw(*given), net.draw_apart(*far, endless), net.draw_apart(*far, None)
+    for x, y in zip(ours, theirs, strict=True):
+        # A number may lie between two roundings of a probability, and what follows in that row differs.
+        assert (x == y).flatten(1).all(1).float().mean() >= (rows - 1) / rows
+        assert (x[:, 1:] != x[:, :-1]).any() and not x[..., _COUNTS == 0].any()
+    assert not torch.equal(ours[1], ours[2]), "not every change is accepted"
+
+
+def _all_states() -> torch.Tensor:
+    """Every state `(n, 3, MOST_TORSIONS)` of three residues with a torsion each, of two, three and two states."""
+    found = torch.zeros(12, 3, MOST_TORSIONS, dtype=torch.long)
+    grid = torch.cartesian_prod(torch.arange(2), torch.arange(3), torch.arange(2))
+    found[:, 0, 0], found[:, 1, 2], found[:, 2, 1] = grid.T
+    return found
+
+
+@pytest.mark.parametrize("by_torch", [True, False])
+def test_frames_far_apart_are_as_often_in_each_state_as_at_endless_times(
+    monkeypatch: pytest.MonkeyPatch, by_torch: bool
+) -> None:
+    if by_torch:
+        _by_torch(monkeypatch)
+    net, states = _lively(coupled=True), _all_states()
+    places, counts = _PLACES[:3], torch.zeros(3, MOST_TORSIONS, dtype=torch.long)
+    counts[0, 0], counts[1, 2], counts[2, 1] = 2, 3, 2
+    endless = Endless(states[[0, 5, 7]], 1e4)
+    each = [net.log_probability(x.expand_as(states), states, places, counts, 1e4).exp() for x in endless.given]
+    wanted = torch.stack(each).mean(0)
+    assert float(wanted.sum()) == pytest.approx(1.0, abs=1e-5)
+    rows, frames = (1000, 24) if by_torch else (400, 100)
+    uniform = torch.rand(rows, frames, counts.numel() + 1, generator=torch.Generator().manual_seed(3))
+    start = states[torch.randint(12, (rows,), generator=torch.Generator().manual_seed(4))]
+    shares = []
+    for kept in (endless, None):
+        drawn = net.draw_apart(start, places, counts, 1000.0, uniform, kept)[:, frames // 2 :].flatten(0, 1)
+        which = (drawn[:, None] == states).flatten(2).all(-1).float()
+        assert (which.sum(1) == 1).all()
+        shares.append(which.mean(0))
+    off, unkept = ((x - wanted).abs().sum() for x in shares)
+    assert off < 0.06 < 0.12 < unkept
+
+
+def _shipped(solvent: str | None = None) -> tuple[PeptideSlide, ChainFeatures, Any, torch.Tensor]:
+    weights = load_weights(weights_path("peptides"))
+    model = under_conditions(weights, {"solvent": solvent} if solvent else {}).model.at_lag(1000.0)
+    assert isinstance(model, PeptideSlide)
+    scene = build_peptide("ACE-ALA-NME")
+    molecule = model.featurise(scene)
+    return model, molecule.own, molecule, torch.tensor(scene.positions_nm).float()[None, None]
+
+
+def test_of_frames_far_apart_only_the_crowded_one_and_what_follows_is_drawn_again(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A frame of the second row is said to overlap until its states are drawn again: these and all after it change."""
+    model, _, molecule, start = _shipped()
+    last, at = start.expand(2, -1, -1, -1), 5
+    noise = torch.randn(2, *model.noise_shape(molecule.n_atoms), generator=torch.Generator().manual_seed(3))
+    plain = model.next_chunk(last, molecule, noise, solver_steps=2)
+    sizes: list[int] = []
+
+    def resolved(tokens: torch.Tensor, states: torch.Tensor, *rest: Any) -> tuple[torch.Tensor, ...]:
+        frames, astray, crowded = mended(tokens, states, *rest)
+        sizes.append(len(frames))
+        if len(sizes) <= 1 + model_module._OVERLAPS:
+            crowded[model.n_new + at if len(sizes) == 1 else 0] = True
+        return frames, astray & False, crowded
+
+    monkeypatch.setattr(model_module, "mended", resolved)
+    chunk = model.next_chunk(last, molecule, noise, solver_steps=2)
+    assert sizes == [2 * model.n_new, 1, 1, model.n_new - at]
+    same = (chunk.frames_nm == plain.frames_nm).flatten(2).all(-1)
+    assert same[0].all() and same[1, :at].all() and not same[1, at:].any()
+    assert chunk.evaluations == pytest.approx(2 * sum(sizes) / sizes[0])
+
+
+def test_frames_far_apart_keep_populations_in_the_first_solvent_alone() -> None:
+    model, chain, *_ = _shipped()
+    assert model.endless(chain) is model.endless(chain) and model.endless(chain) is not None
+    assert [model.keeps_populations(x) for x in (100.0, 101.0, 500.0, 501.0, 1000.0)] == [
+        True,
+        False,
+        False,
+        True,
+        True,
+    ]
+    model, chain, *_ = _shipped("tip3p")
+    assert model.endless(chain) is None
+    assert [model.keeps_populations(x) for x in (20.0, 100.0, 1000.0)] == [True, False, False]
