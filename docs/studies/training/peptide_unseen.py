@@ -247,15 +247,16 @@ def lag_errors(md: Runs, at_10: Runs, others: dict[float, Runs]) -> dict[str, fl
 
 
 def endless(weights: Weights, scene: Scene, starts_nm: FloatArray, solvent: str | None) -> list[FloatArray]:
-    """Return ENDLESS frames after each start, each drawn by itself when nothing is left of the start."""
+    """Return ENDLESS frames after each start, each when nothing is left of the one before."""
     fitted, _ = fit_weights(scene, weights, lag_ps=FRAMES_PS, force=True, solvent=solvent)
     model = cast(PeptideSlide, copy(fitted.model))
     model.lag_ps = model.config.forgotten_ps
-    frames = torch.from_numpy(starts_nm).float().repeat_interleave(ENDLESS, dim=0)[:, None]
+    rows = math.ceil(ENDLESS / model.n_new)
+    frames = torch.from_numpy(starts_nm).float().repeat_interleave(rows, dim=0)[:, None]
     noise = torch.randn(len(frames), *model.noise_shape(scene.n_atoms), generator=torch.Generator().manual_seed(SEED))
     with torch.no_grad():
         found = model.next_chunk(frames, model.featurise(scene), noise, solver_steps=model.usual_steps).frames_nm
-    return [x.double().numpy() for x in found[:, 0].split(ENDLESS)]
+    return [x.double().flatten(0, 1)[:ENDLESS].numpy() for x in found.split(rows)]
 
 
 def population_errors(md: Runs, others: Mapping[str, Runs]) -> dict[str, float]:

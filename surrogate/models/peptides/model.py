@@ -23,7 +23,7 @@ from surrogate.models.lam_slide import flow
 from surrogate.models.layers import ParallelBlock, TimeEmbedding, rotary_angles
 from surrogate.models.peptides.chains import MOST_STATES, MOST_TORSIONS, ChainFeatures, conditioning_states, mended
 from surrogate.models.peptides.layout import PeptideConfig, chain_features
-from surrogate.models.peptides.state_jumps import FAR, Endless, StateJumps, distances_along
+from surrogate.models.peptides.state_jumps import FAR, StateJumps, distances_along
 from surrogate.models.propagator import Chunk, Molecule, Propagator, row_by_row
 from systems.chemistry.geometry import superpose
 from systems.errors import InputError
@@ -55,8 +55,6 @@ _MOST_CORRELATED = 0.995
 _LONGEST_WAVE = 4.0
 # As many times as many frames make a chunk where each is drawn on its own.
 _FAR_APART = 4
-# Frames that states at endless times are the mean after, and in how many draws these forget where they began.
-_ENDLESS_FRAMES, _ENDLESS_TIMES = 16, 4
 # Chunks that disobey the states that were drawn for them, or whose atoms overlap, are drawn again so often.
 MAX_REDRAWS = 8
 # Where atoms overlap so many times, there may be no room for them in these states, and these are drawn again, too.
@@ -215,7 +213,6 @@ class PeptideSlide(Propagator):
         self.token_mean = nn.Buffer(torch.zeros(n_kinds, MOST_STATES, n_slots))
         self.token_scale = nn.Buffer(torch.ones(n_kinds, n_slots))
         self.correlation = nn.Buffer(torch.zeros(n_kinds, len(config.lags_ps), n_slots))
-        self._endless: tuple[ChainFeatures, Endless] | None = None
 
     def featurise(self, scene: Scene) -> Molecule:
         """See `Propagator.featurise`; `own`: the chain's `ChainFeatures`. Raises InputError for a scene that is no
@@ -318,22 +315,6 @@ class PeptideSlide(Propagator):
         y = flow.SOLVERS[solver](predict, drawn, solver_steps)
         return self._tokens(self.from_innovations(y, observed, times_ps, self.kinds(chain)), states, chain), evaluations
 
-    def endless(self, chain: ChainFeatures) -> Endless | None:
-        """Return the states at endless times that frames far apart keep; None in other solvents than the first, where
-        populations are set in steps alone."""
-        if chain.solvent:
-            return None
-        if self._endless is None or self._endless[0] is not chain:
-            generator, counts = torch.Generator().manual_seed(0), chain.stated.counts
-            states = counts.new_zeros(_ENDLESS_FRAMES, *counts.shape)
-            time = torch.full((len(states), 1), self.config.forgotten_ps, device=counts.device)
-            none = time.new_zeros(*states.shape[:2], chain.code.n_slots)
-            for _ in range(_ENDLESS_TIMES):
-                uniform = torch.rand(len(states), 1, *counts.shape, generator=generator).to(time)
-                states = self.jumps.draw(none, states, chain.places, counts, time, time, uniform)[:, 0]
-            self._endless = chain, Endless(states, self.config.forgotten_ps)
-        return self._endless[1]
-
     def noise_shape(self, n_atoms: int) -> tuple[int, ...]:
         # At least as many numbers as a frame has coordinates that vary.
         return (self.n_new, n_atoms, 4)
@@ -354,19 +335,16 @@ class PeptideSlide(Propagator):
         n_new, far_apart, device = self.n_new, self.far_apart(lag_ps), observed.device
         ahead = torch.ones(n_new) if far_apart else torch.arange(1, n_new + 1)
         times = (lag_ps * ahead.to(observed)).expand(len(observed), -1)
-        apart = times_apart(times, self.config.forgotten_ps)
+        apart = times if far_apart else times_apart(times, self.config.forgotten_ps)
         drawn = observed.new_zeros(*noise.shape[:2], *filled.shape)
         drawn[..., filled] = noise.flatten(2)[..., : int(filled.sum())].to(observed)
         jumps = self.jumps_of(chain)
-        known = (chain.places, counts)
 
         def draw_states(rows: Tensor, before: Tensor, attempt: int) -> Tensor:
             seeds = generators(noise[rows], STATES, attempt)
-            if far_apart:
-                uniform = torch.stack([torch.rand(n_new, counts.numel() + 1, generator=g) for g in seeds]).to(observed)
-                return jumps.draw_apart(before, *known, lag_ps, uniform, self.endless(chain))
             uniform = torch.stack([torch.rand(n_new, *counts.shape, generator=g) for g in seeds]).to(observed)
-            return jumps.draw(observed[rows], before, *known, times[rows], apart[rows], uniform)
+            given = None if far_apart else observed[rows]
+            return jumps.draw(given, before, chain.places, counts, times[rows], apart[rows], uniform)
 
         states = draw_states(torch.arange(len(observed)), now, 0)
         frames = observed.new_empty(*times.shape, *last_frames_nm.shape[-2:])

@@ -103,181 +103,80 @@ static void pass(const Net &net, const Block &block, std::vector<float> &h, std:
     for (int64_t k = 0; k < all * WIDTH; ++k) h[k] += gate[k % WIDTH] * (one[k] + two[k]);
 }
 
-// Draws a state by `logits` of `count` and a number in [0, 1), or takes the one that it is given where there is none;
-// adds the logarithm of its probability.
-static int64_t taken(const float *logits, int64_t count, const float *uniform, int64_t state, double *log_probability) {
+// Return the state that a number in [0, 1) draws by `logits` of `count` states.
+static int64_t drawn(const float *logits, int64_t count, float uniform) {
     float shares[STATES], sum = 0, most = logits[0], share = 0;
+    int64_t state = 0;
     for (int j = 1; j < count; ++j) most = fmaxf(most, logits[j]);
     for (int j = 0; j < count; ++j) sum += shares[j] = expf(fmaxf(logits[j] - most, -80));
-    if (uniform) {
-        state = 0;
-        for (int j = 0; j + 1 < count; ++j) state += *uniform >= (share += shares[j] / sum);
-    }
-    *log_probability += logits[state] - most - logf(sum);
+    for (int j = 0; j + 1 < count; ++j) state += uniform >= (share += shares[j] / sum);
     return state;
 }
 
-// What windows know of a frame: the states of the one before, the levels of changes (TORSIONS, residues, STATES, STATES),
-// numbers `uniform` (residues, TORSIONS) to draw by, or none where the states `fresh` (residues, TORSIONS) are given.
-struct Window {
-    const int64_t *now;
-    const float *levels, *uniform;
-    int64_t *fresh;
-    double log_probability;
-};
-struct Work {
-    std::vector<float> x, y, logits, of_blocks;
-    std::vector<int64_t> items;
-};
-
-// Goes through the torsions of windows, of which `h` (windows, residues, WIDTH) is all but what new states tell.
-static void go_through(const Net &net, std::vector<Window> &windows, const float *h, Work &work) {
-    const int64_t n = net.n_residues;
-    work.x.resize(windows.size() * n * WIDTH), work.y.resize(windows.size() * n * WIDTH);
-    work.logits.resize(windows.size() * n * STATES);
-    for (int turn = 0; turn < 1 + net.coupled; ++turn)
-        for (int torsion = 0; torsion < TORSIONS; ++torsion) {
-            work.items.clear();
-            for (size_t k = 0; k < windows.size(); ++k)
-                for (int64_t r = turn; r < n; r += 1 + net.coupled) {
-                    if (!net.counts[r * TORSIONS + torsion]) continue;
-                    const int64_t *fresh = windows[k].fresh;
-                    float *own = &work.x[work.items.size() * WIDTH];
-                    work.items.push_back(k * n + r);
-                    for (int i = 0; i < WIDTH; ++i)
-                        own[i] = h[(k * n + r) * WIDTH + i] + net.torsion[torsion * WIDTH + i];
-                    for (int j = 1; j < 3 && turn; ++j) add(own, net.beside[j - 1], net, fresh, r + PLACES[j]);
-                    add(own, net.fresh[torsion], net, fresh, r, torsion);
-                    for (int i = 0; i < WIDTH; ++i) own[i] = silu(own[i]);
-                }
-            const int64_t n_items = work.items.size();
-            apply<WIDTH>(net.hidden, work.x.data(), work.y.data(), n_items, WIDTH);
-            for (int64_t i = 0; i < n_items * WIDTH; ++i) work.y[i] = silu(work.y[i]);
-            apply<WIDTH>(net.logits, work.y.data(), work.logits.data(), n_items, STATES);
-            for (int64_t item = 0; item < n_items; ++item) {
-                Window &window = windows[work.items[item] / n];
-                const int64_t r = work.items[item] % n, place = r * TORSIONS + torsion, now = window.now[place];
-                const float *level = window.levels + ((torsion * n + r) * STATES + now) * STATES;
-                float *own = &work.logits[item * STATES];
-                // To stay has the logit zero.
-                for (int j = 0; j < STATES; ++j) own[j] = j == now ? 0 : own[j] + level[j];
-                const float *uniform = window.uniform ? window.uniform + place : nullptr;
-                window.fresh[place] =
-                    taken(own, net.counts[place], uniform, window.fresh[place], &window.log_probability);
-            }
-        }
-}
-
-// Adds to h (residues, WIDTH) what the states of the frame before and of the one before that tell.
-static void add_before(float *h, const Net &net, const int64_t *now, const int64_t *earlier) {
-    for (int64_t r = 0; r < net.n_residues; ++r) {
-        for (int j = 0; j < 3; ++j) add(h + r * WIDTH, net.before[j], net, now, r + PLACES[j]);
-        add(h + r * WIDTH, net.earlier, net, earlier, r);
-    }
-}
-
-// `common` (rows, frames, residues, WIDTH): what `of_times_alone` and `of_observed` add up to; `levels` (rows, frames,
-// TORSIONS, residues, STATES, STATES), `given` (rows, residues, TORSIONS), `uniform` and `out` (rows, frames, residues,
-// TORSIONS).
+// `common` (rows, frames, residues, WIDTH): what `of_times_alone` and `of_observed` add up to, the latter left out where
+// `apart`: then it follows for each frame from the states of the one before. `levels` (rows, frames, TORSIONS, residues,
+// STATES, STATES), `given` (rows, residues, TORSIONS), `uniform` and `out` (rows, frames, residues, TORSIONS).
 extern "C" void draw(
-    const Net *net, int64_t rows, int64_t frames, const float *common, const float *levels, const int64_t *given,
-    const float *uniform, int64_t *out
-) {
-    const int64_t n = net->n_residues, size = n * TORSIONS;
-    std::vector<float> h(rows * n * WIDTH);
-    std::vector<Window> windows(rows);
-    Work work;
-    memset(out, 0, sizeof(int64_t) * rows * frames * size);
-    for (int64_t frame = 0; frame < frames; ++frame) {
-        for (int64_t row = 0; row < rows; ++row) {
-            const int64_t k = row * frames + frame;
-            auto before = [&](int64_t by) { return frame < by ? given + row * size : out + (k - by) * size; };
-            memcpy(&h[row * n * WIDTH], common + k * n * WIDTH, sizeof(float) * n * WIDTH);
-            add_before(&h[row * n * WIDTH], *net, before(1), before(2));
-            windows[row] = {before(1), levels + k * size * STATES * STATES, uniform + k * size, out + k * size, 0};
-        }
-        go_through(*net, windows, h.data(), work);
-    }
-}
-
-// A molecule's states at endless times, in the mean over `n` frames before: their states `given` (n, residues, TORSIONS),
-// of each all but what new states tell `h` (n, residues, WIDTH), and `levels` of changes; n = 0 where none are kept.
-struct Endless {
-    int64_t n;
-    const int64_t *given;
-    const float *h, *levels;
-};
-
-// Return the logarithm of how likely states are at endless times, but for a constant.
-static double log_share(const Net &net, const Endless &endless, int64_t *states, Work &work) {
-    std::vector<Window> windows(endless.n);
-    for (int64_t k = 0; k < endless.n; ++k)
-        windows[k] = {endless.given + k * net.n_residues * TORSIONS, endless.levels, nullptr, states, 0};
-    go_through(net, windows, endless.h, work);
-    double most = windows[0].log_probability, sum = 0;
-    for (const Window &window : windows) most = fmax(most, window.log_probability);
-    for (const Window &window : windows) sum += exp(window.log_probability - most);
-    return most + log(sum);
-}
-
-// States of frames each of which follows from those of the one before alone, `time` (WIDTH) and `levels` (TORSIONS,
-// residues, STATES, STATES) later, accepted by the rule of Metropolis and Hastings where `endless` is known. `uniform` (rows, frames, residues *
-// TORSIONS + 1): the last number is for that.
-extern "C" void draw_apart(
-    const Net *net, const Endless *endless, int64_t rows, int64_t frames, const float *time, const float *levels,
+    const Net *whole, int64_t rows, int64_t frames, int64_t apart, const float *common, const float *levels,
     const int64_t *given, const float *uniform, int64_t *out
 ) {
-    const int64_t n = net->n_residues, size = n * TORSIONS, wide = n * WIDTH;
-    std::vector<float> h(rows * wide), after(rows * wide);
-    std::vector<int64_t> now(given, given + rows * size), back(rows * size);
-    std::vector<double> share(rows);
-    std::vector<Window> there(rows), again(rows);
-    Work work;
-
-    auto known = [&](std::vector<float> &into, int64_t *states, int64_t stride) {
-        for (int64_t row = 0; row < rows; ++row) {
-            memcpy(&into[row * wide], net->types, sizeof(float) * wide);
-            for (int64_t r = 0; r < n; ++r)
-                for (int j = 0; j < 3; ++j)
-                    add(&into[row * wide + r * WIDTH], net->given[j], *net, states + row * stride, r + PLACES[j]);
-        }
-        for (int b = 0; b < BLOCKS && net->coupled; ++b) pass(*net, net->blocks[b], into, work.of_blocks);
-        for (int64_t row = 0; row < rows; ++row) {
-            for (int64_t i = 0; i < wide; ++i) into[row * wide + i] += time[i % WIDTH];
-            add_before(&into[row * wide], *net, states + row * stride, states + row * stride);
-        }
-    };
-
-    known(h, now.data(), size);
-    for (int64_t row = 0; row < rows && endless->n; ++row)
-        share[row] = log_share(*net, *endless, &now[row * size], work);
+    const Net &net = *whole;
+    const int64_t n = net.n_residues, size = n * TORSIONS, wide = n * WIDTH;
+    std::vector<float> h(rows * wide), x(rows * wide), y(rows * wide), logits(rows * n * STATES), work;
+    std::vector<int64_t> items;
+    memset(out, 0, sizeof(int64_t) * rows * frames * size);
     for (int64_t frame = 0; frame < frames; ++frame) {
+        auto before = [&](int64_t row, int64_t by) {
+            return frame < by ? given + row * size : out + (row * frames + frame - by) * size;
+        };
+        memset(h.data(), 0, sizeof(float) * h.size());
+        if (apart) {
+            for (int64_t row = 0; row < rows; ++row) {
+                memcpy(&h[row * wide], net.types, sizeof(float) * wide);
+                for (int64_t r = 0; r < n; ++r)
+                    for (int j = 0; j < 3; ++j)
+                        add(&h[row * wide + r * WIDTH], net.given[j], net, before(row, 1), r + PLACES[j]);
+            }
+            for (int b = 0; b < BLOCKS && net.coupled; ++b) pass(net, net.blocks[b], h, work);
+        }
         for (int64_t row = 0; row < rows; ++row) {
-            int64_t *fresh = out + (row * frames + frame) * size;
-            memset(fresh, 0, sizeof(int64_t) * size);
-            there[row] = {&now[row * size], levels, uniform + (row * frames + frame) * (size + 1), fresh, 0};
+            const float *from = common + (row * frames + frame) * wide;
+            for (int64_t i = 0; i < wide; ++i) h[row * wide + i] += from[i];
+            for (int64_t r = 0; r < n; ++r) {
+                float *own = &h[row * wide + r * WIDTH];
+                for (int j = 0; j < 3; ++j) add(own, net.before[j], net, before(row, 1), r + PLACES[j]);
+                // The first frame knows none before the given one, and so does each that follows from states alone.
+                add(own, net.earlier, net, before(row, apart ? 1 : 2), r);
+            }
         }
-        go_through(*net, there, h.data(), work);
-        known(after, out + frame * size, frames * size);
-        if (!endless->n) {
-            for (int64_t row = 0; row < rows; ++row) memcpy(&now[row * size], there[row].fresh, sizeof(int64_t) * size);
-            h.swap(after);
-            continue;
-        }
-        back = now;
-        for (int64_t row = 0; row < rows; ++row) again[row] = {there[row].fresh, levels, nullptr, &back[row * size], 0};
-        go_through(*net, again, after.data(), work);
-        for (int64_t row = 0; row < rows; ++row) {
-            int64_t *fresh = there[row].fresh, *own = &now[row * size];
-            if (!memcmp(fresh, own, sizeof(int64_t) * size)) continue;
-            const double likely = log_share(*net, *endless, fresh, work);
-            const double ratio = likely - share[row] + again[row].log_probability - there[row].log_probability;
-            if (there[row].uniform[size] < exp(fmin(0, ratio))) {
-                memcpy(own, fresh, sizeof(int64_t) * size);
-                memcpy(&h[row * wide], &after[row * wide], sizeof(float) * wide);
-                share[row] = likely;
-            } else
-                memcpy(fresh, own, sizeof(int64_t) * size);
-        }
+        for (int turn = 0; turn < 1 + net.coupled; ++turn)
+            for (int torsion = 0; torsion < TORSIONS; ++torsion) {
+                items.clear();
+                for (int64_t row = 0; row < rows; ++row)
+                    for (int64_t r = turn; r < n; r += 1 + net.coupled) {
+                        if (!net.counts[r * TORSIONS + torsion]) continue;
+                        const int64_t *fresh = before(row, 0);
+                        float *own = &x[items.size() * WIDTH];
+                        items.push_back(row * n + r);
+                        for (int i = 0; i < WIDTH; ++i)
+                            own[i] = h[row * wide + r * WIDTH + i] + net.torsion[torsion * WIDTH + i];
+                        for (int j = 1; j < 3 && turn; ++j) add(own, net.beside[j - 1], net, fresh, r + PLACES[j]);
+                        add(own, net.fresh[torsion], net, fresh, r, torsion);
+                        for (int i = 0; i < WIDTH; ++i) own[i] = silu(own[i]);
+                    }
+                const int64_t n_items = items.size();
+                apply<WIDTH>(net.hidden, x.data(), y.data(), n_items, WIDTH);
+                for (int64_t i = 0; i < n_items * WIDTH; ++i) y[i] = silu(y[i]);
+                apply<WIDTH>(net.logits, y.data(), logits.data(), n_items, STATES);
+                for (int64_t item = 0; item < n_items; ++item) {
+                    const int64_t row = items[item] / n, r = items[item] % n, place = r * TORSIONS + torsion;
+                    const int64_t now = before(row, 1)[place], k = row * frames + frame;
+                    const float *level = levels + (((k * TORSIONS + torsion) * n + r) * STATES + now) * STATES;
+                    float *own = &logits[item * STATES];
+                    // To stay has the logit zero.
+                    for (int j = 0; j < STATES; ++j) own[j] = j == now ? 0 : own[j] + level[j];
+                    out[k * size + place] = drawn(own, net.counts[place], uniform[k * size + place]);
+                }
+            }
     }
 }

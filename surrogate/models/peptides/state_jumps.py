@@ -9,10 +9,10 @@ from __future__ import annotations
 
 import ctypes
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
-from typing import NamedTuple, cast
+from typing import cast
 
 import torch
 from torch import Tensor, nn
@@ -31,14 +31,6 @@ _FAST = 10.0
 # Residues further apart along the chain are alike far.
 FAR = 6
 _COUPLED_BLOCKS, _COUPLED_HEADS = 2, 4
-
-
-class Endless(NamedTuple):
-    """The states of a molecule long after any frame: as likely as `time_ps` after frames in states `given` (n,
-    n_residues, MOST_TORSIONS)."""
-
-    given: Tensor
-    time_ps: float
 
 
 class StateJumps(nn.Module):
@@ -92,7 +84,7 @@ class StateJumps(nn.Module):
         `places` (r, 4) -> (b, r, width)."""
         beside = _beside(conditioning_states(states, counts))
         h: Tensor = sum((of(x) for of, x in zip(self.of_given, beside, strict=True)), self.of_numbers(observed.float()))
-        of_types, bias = self.of_types(places)
+        of_types, bias = self._of_types(places)
         h = h + of_types
         if bias is not None:
             still = h.new_zeros(len(h), 3, _WIDTH)
@@ -100,7 +92,7 @@ class StateJumps(nn.Module):
                 h = block(h[:, None], still, None, bias=bias)[0][:, 0]
         return h
 
-    def of_types(self, places: Tensor) -> tuple[Tensor, Tensor | None]:
+    def _of_types(self, places: Tensor) -> tuple[Tensor, Tensor | None]:
         """What types tell `(r, width)`, and the scores of `blocks` (heads, r, r) by how far residues are apart."""
         of_types: Tensor = self.of_type(places[:, 0])
         if not self.coupled:
@@ -200,19 +192,27 @@ class StateJumps(nn.Module):
                 yield torsion, has, self.probabilities(torsion, *own)
 
     def draw(
-        self, observed: Tensor, states: Tensor, places: Tensor, counts: Tensor, times_ps: Tensor, apart_ps: Tensor,
-        uniform: Tensor, shares: Tensor | None = None,
+        self, observed: Tensor | None, states: Tensor, places: Tensor, counts: Tensor, times_ps: Tensor,
+        apart_ps: Tensor, uniform: Tensor, shares: Tensor | None = None,
     ) -> Tensor:  # fmt: skip
         """Return states `(b, t, r, MOST_TORSIONS)` of new frames, from the given frame's numbers and `states`
         (b, r, MOST_TORSIONS) and numbers `uniform` (b, t, r, MOST_TORSIONS) in [0, 1). Their probabilities are written
-        to `shares` (b, t, r, MOST_TORSIONS, MOST_STATES)."""
-        with torch.autocast(observed.device.type, enabled=False):
+        to `shares` (b, t, r, MOST_TORSIONS, MOST_STATES). Without `observed` each frame follows from the states of the
+        one before alone, as the first after a frame whose numbers are their means."""
+        with torch.autocast(times_ps.device.type, enabled=False):
+            program = _program() if shares is None and times_ps.device.type == "cpu" else None
+            if observed is None and program is None:
+                none, found = times_ps.new_zeros(*states.shape[:2], self.of_numbers.in_features), [states[:, None]]
+                for one in zip(*(x.split(1, dim=1) for x in (times_ps, apart_ps, uniform)), strict=True):
+                    found.append(self.draw(none, found[-1][:, 0], places, counts, *one))
+                return torch.cat(found[1:], dim=1)
             of_times, levels = self.of_times_alone(times_ps, apart_ps, places, counts)
-            common = self.of_observed(observed, states, places, counts)[:, None] + of_times[:, :, None]
-            program = _program() if shares is None and observed.device.type == "cpu" else None
+            common = of_times[:, :, None].expand(-1, -1, len(places), -1)
+            if observed is not None:
+                common = common + self.of_observed(observed, states, places, counts)[:, None]
             if program is not None:
-                call = _Call(self, places, counts)
-                return call(program.draw, states, uniform, common, levels)
+                apart = observed is None
+                return self._drawn(program, states, places, counts, common, levels, uniform, apart=apart)
             # A residue's torsion in each state, as `conditioning_states` has it.
             ones = torch.eye(MOST_STATES, device=counts.device) * (counts > 0)[..., None, None]
             residues, most = torch.arange(len(counts), device=counts.device), (counts - 1).clamp(min=0)
@@ -242,67 +242,38 @@ class StateJumps(nn.Module):
                 now = new
             return torch.cat(found, dim=1)
 
-    def draw_apart(
-        self, states: Tensor, places: Tensor, counts: Tensor, time_ps: float, uniform: Tensor,
-        endless: Endless | None,
-    ) -> Tensor:  # fmt: skip
-        """Return states `(b, t, r, MOST_TORSIONS)` of frames `time_ps` apart, each of which follows from the states of
-        the one before alone; the first from `states` (b, r, MOST_TORSIONS). With `endless` what the probabilities
-        propose is accepted by the rule of Metropolis and Hastings (Biometrika 57, 97 (1970)), so that states are as
-        likely as at endless times. `uniform` (b, t, r * MOST_TORSIONS + 1), in [0, 1): the last for acceptance."""
-        program = _program() if states.device.type == "cpu" else None
-        if program is not None:
-            call, (time, levels) = _Call(self, places, counts), self._at(time_ps, places, counts)
-            known = _Endless() if endless is None else self._c_endless(call, endless)
-            return call(program.draw_apart, states, uniform, time, levels, known)
-        propose, last = uniform[..., :-1].unflatten(-1, counts.shape), uniform[..., -1].double()
-        time, none = states.new_full((len(states), 1), time_ps, dtype=torch.float32), self._no_numbers(states)
-        now, found = states, []
-        for k in range(uniform.shape[1]):
-            new = self.draw(none, now, places, counts, time, time, propose[:, k : k + 1])[:, 0]
-            if endless is not None:
-                there, back = ((a, b, places, counts, time_ps) for a, b in ((now, new), (new, now)))
-                ratio = self.log_probability(*back) - self.log_probability(*there)
-                ratio += self._log_share(new, places, counts, endless) - self._log_share(now, places, counts, endless)
-                new = torch.where((last[:, k] < ratio.exp())[:, None, None], new, now)
-            now = new
-            found.append(now)
-        return torch.stack(found, dim=1)
+    def _drawn(
+        self, program: ctypes.CDLL, states: Tensor, places: Tensor, counts: Tensor, *numbers: Tensor, apart: bool
+    ) -> Tensor:
+        """Return what `draw` does, by the program, which reads weights where they are."""
+        kept: list[Tensor] = []
 
-    def log_probability(self, before: Tensor, after: Tensor, places: Tensor, counts: Tensor, time_ps: float) -> Tensor:
-        """Return the logarithm of how likely states `after` (b, r, MOST_TORSIONS) are `time_ps` after a frame in states
-        `before` whose numbers are their means, `(b,)`."""
-        time = before.new_full((len(before), 1), time_ps, dtype=torch.float32)
-        windows = self._no_numbers(before), torch.stack([before, after], dim=1), places, counts, time, time
-        found = before.new_zeros(len(before), dtype=torch.float64)
-        for torsion, has, logits in self.of_windows(*windows):
-            found += logits.double().log_softmax(-1).gather(-1, after[:, None, has, torsion, None]).sum((1, 2, 3))
+        def at(tensor: Tensor) -> int:
+            kept.append(tensor.detach().contiguous())
+            return kept[-1].data_ptr()
+
+        def linear(layer: nn.Module) -> _Linear:
+            bias = cast(Tensor | None, layer.bias)
+            return _Linear(at(cast(Tensor, layer.weight)), None if bias is None else at(bias))
+
+        of_types, distances = self._of_types(places)
+        net = _Net(len(places), self.coupled, at(counts))
+        for name, layers in (("given", self.of_given), ("before", self.of_before), ("fresh", self.of_new)):
+            getattr(net, name)[:] = [linear(layer) for layer in layers]
+        net.earlier, net.hidden, net.logits = (linear(layer) for layer in (self.of_earlier, self.hidden, self.logits))
+        net.torsion, net.types = at(self.of_torsion.weight), at(of_types)
+        if distances is not None:
+            net.distances = at(distances)
+            net.beside[:] = [linear(layer) for layer in self.of_new_beside]
+            for k, block in enumerate(cast(list[ParallelBlock], list(self.blocks))):
+                parts = block.proj_in, block.attention_out, block.mlp_out
+                net.blocks[k] = _Block(at(block.offset), *(linear(part) for part in parts))
+        common, levels, uniform = numbers
+        found = states.new_empty(uniform.shape)
+        arrays = at(common), at(levels), at(states), at(uniform), found.data_ptr()
+        sizes = (ctypes.c_int64(n) for n in (*uniform.shape[:2], apart))
+        program.draw(ctypes.byref(net), *sizes, *(ctypes.c_void_p(x) for x in arrays))
         return found
-
-    def _log_share(self, states: Tensor, places: Tensor, counts: Tensor, endless: Endless) -> Tensor:
-        """Return the logarithm of how likely states `(b, r, MOST_TORSIONS)` are at endless times, but for a
-        constant."""
-        each = [
-            self.log_probability(given.expand_as(states), states, places, counts, endless.time_ps)
-            for given in endless.given
-        ]
-        return torch.stack(each).logsumexp(0)
-
-    def _no_numbers(self, states: Tensor) -> Tensor:
-        return states.new_zeros(*states.shape[:2], self.of_numbers.in_features, dtype=torch.float32)
-
-    def _at(self, time_ps: float, places: Tensor, counts: Tensor) -> tuple[Tensor, Tensor]:
-        """Return what `of_times_alone` does of one time: `(width,)` and `(MOST_TORSIONS, r, from, to)`."""
-        time = torch.full((1, 1), time_ps)
-        of_times, levels = self.of_times_alone(time, time, places, counts)
-        return of_times[0, 0], levels[0, 0]
-
-    def _c_endless(self, call: _Call, endless: Endless) -> _Endless:
-        of_times, levels = self._at(endless.time_ps, call.places, call.counts)
-        before = conditioning_states(endless.given, call.counts)
-        h = self.of_observed(self._no_numbers(endless.given), endless.given, call.places, call.counts)
-        h = h + of_times + self.of_frames(before[:, None], before[:, None])[:, 0]
-        return _Endless(len(endless.given), *(call.at(x) for x in (endless.given, h, levels)))
 
 
 # The program, and what it takes, as `state_jumps.cpp` declares it.
@@ -325,10 +296,6 @@ class _Net(ctypes.Structure):
     ]  # fmt: skip
 
 
-class _Endless(ctypes.Structure):
-    _fields_ = [("n", ctypes.c_int64), *((name, ctypes.c_void_p) for name in ("given", "h", "levels"))]
-
-
 @cache
 def _program() -> ctypes.CDLL | None:
     """Return the program; None where it cannot be compiled."""
@@ -338,47 +305,6 @@ def _program() -> ctypes.CDLL | None:
         return compiled_program(Path(__file__).with_suffix(".cpp"), sizes)
     except (CompilerError, OSError):
         return None
-
-
-class _Call:
-    """A call of the program with the weights of `jumps` for residues at `places`, which it reads where they are."""
-
-    def __init__(self, jumps: StateJumps, places: Tensor, counts: Tensor) -> None:
-        self.places, self.counts, self._kept = places, counts, list[Tensor]()
-        of_types, distances = jumps.of_types(places)
-        net = self._net = _Net(len(places), jumps.coupled)
-        for name, several in (("given", jumps.of_given), ("before", jumps.of_before), ("fresh", jumps.of_new)):
-            getattr(net, name)[:] = [self._linear(layer) for layer in several]
-        net.earlier, net.hidden, net.logits = (self._linear(x) for x in (jumps.of_earlier, jumps.hidden, jumps.logits))
-        net.torsion, net.counts = self.at(jumps.of_torsion.weight), self.at(counts)
-        net.types = self.at(of_types)
-        if distances is not None:
-            net.distances = self.at(distances)
-            net.beside[:] = [self._linear(layer) for layer in jumps.of_new_beside]
-            for k, block in enumerate(cast(list[ParallelBlock], list(jumps.blocks))):
-                layers = block.proj_in, block.attention_out, block.mlp_out
-                net.blocks[k] = _Block(self.at(block.offset), *(self._linear(layer) for layer in layers))
-
-    def at(self, tensor: Tensor) -> int:
-        """Return where a tensor lies as long as this call does."""
-        self._kept.append(tensor.detach().contiguous())
-        return self._kept[-1].data_ptr()
-
-    def _linear(self, layer: nn.Module) -> _Linear:
-        bias = cast(Tensor | None, layer.bias)
-        return _Linear(self.at(cast(Tensor, layer.weight)), None if bias is None else self.at(bias))
-
-    def __call__(
-        self, function: Callable[..., None], states: Tensor, uniform: Tensor, common: Tensor, levels: Tensor,
-        endless: _Endless | None = None,
-    ) -> Tensor:  # fmt: skip
-        """Return states `(b, t, r, MOST_TORSIONS)` that a function of the program draws."""
-        found = states.new_empty(*uniform.shape[:2], *self.counts.shape)
-        first = [ctypes.byref(x) for x in (self._net, endless) if x is not None]
-        sizes = [ctypes.c_int64(n) for n in uniform.shape[:2]]
-        arrays = [ctypes.c_void_p(self.at(x)) for x in (common, levels, states, uniform)]
-        function(*first, *sizes, *arrays, ctypes.c_void_p(found.data_ptr()))
-        return found
 
 
 def distances_along(n: int, device: torch.device) -> Tensor:

@@ -12,7 +12,7 @@ from surrogate.models.peptides import model as model_module
 from surrogate.models.peptides import state_jumps
 from surrogate.models.peptides.chains import MOST_STATES, MOST_TORSIONS, ChainFeatures, mended
 from surrogate.models.peptides.model import PeptideSlide
-from surrogate.models.peptides.state_jumps import Endless, StateJumps
+from surrogate.models.peptides.state_jumps import StateJumps
 from surrogate.models.weights import load_weights
 from surrogate.sampling.domain import under_conditions
 from systems.prepare.peptide import build_peptide
@@ -58,51 +58,31 @@ def test_the_program_draws_what_torch_draws(monkeypatch: pytest.MonkeyPatch, cou
     times = torch.stack([x * ahead for x in torch.linspace(1.0, 80.0, rows)])
     apart = times[:, :1].expand_as(times)
     uniform = torch.rand(rows, 12, *_COUNTS.shape, generator=generator)
-    given = observed, _given(rows), _PLACES, _COUNTS, times, apart, uniform
-    endless = Endless(_given(5), 1e4)
-    far = _given(rows), _PLACES, _COUNTS, 1000.0, torch.rand(rows, 12, _COUNTS.numel() + 1, generator=generator)
-    ours = net.draw(*given), net.draw_apart(*far, endless), net.draw_apart(*far, None)
+    given = _given(rows), _PLACES, _COUNTS, times, apart, uniform
+    far = torch.full_like(times, 1000.0)
+    calls = (observed, *given), (None, *given[:3], far, far, uniform)
+    ours = [net.draw(*call) for call in calls]
     _by_torch(monkeypatch)
-    theirs = net.draw(*given), net.draw_apart(*far, endless), net.draw_apart(*far, None)
+    theirs = [net.draw(*call) for call in calls]
     for x, y in zip(ours, theirs, strict=True):
         # A number may lie between two roundings of a probability, and what follows in that row differs.
         assert (x == y).flatten(1).all(1).float().mean() >= (rows - 1) / rows
         assert (x[:, 1:] != x[:, :-1]).any() and not x[..., _COUNTS == 0].any()
-    assert not torch.equal(ours[1], ours[2]), "not every change is accepted"
-
-
-def _all_states() -> torch.Tensor:
-    """Every state `(n, 3, MOST_TORSIONS)` of three residues with a torsion each, of two, three and two states."""
-    found = torch.zeros(12, 3, MOST_TORSIONS, dtype=torch.long)
-    grid = torch.cartesian_prod(torch.arange(2), torch.arange(3), torch.arange(2))
-    found[:, 0, 0], found[:, 1, 2], found[:, 2, 1] = grid.T
-    return found
 
 
 @pytest.mark.parametrize("by_torch", [True, False])
-def test_frames_far_apart_are_as_often_in_each_state_as_at_endless_times(
+def test_of_frames_far_apart_each_follows_from_the_states_before_alone(
     monkeypatch: pytest.MonkeyPatch, by_torch: bool
 ) -> None:
+    """From the second frame on a chunk goes on as one that begins there; chunks of frames near each other do not."""
     if by_torch:
         _by_torch(monkeypatch)
-    net, states = _lively(coupled=True), _all_states()
-    places, counts = _PLACES[:3], torch.zeros(3, MOST_TORSIONS, dtype=torch.long)
-    counts[0, 0], counts[1, 2], counts[2, 1] = 2, 3, 2
-    endless = Endless(states[[0, 5, 7]], 1e4)
-    each = [net.log_probability(x.expand_as(states), states, places, counts, 1e4).exp() for x in endless.given]
-    wanted = torch.stack(each).mean(0)
-    assert float(wanted.sum()) == pytest.approx(1.0, abs=1e-5)
-    rows, frames = (1000, 24) if by_torch else (400, 100)
-    uniform = torch.rand(rows, frames, counts.numel() + 1, generator=torch.Generator().manual_seed(3))
-    start = states[torch.randint(12, (rows,), generator=torch.Generator().manual_seed(4))]
-    shares = []
-    for kept in (endless, None):
-        drawn = net.draw_apart(start, places, counts, 1000.0, uniform, kept)[:, frames // 2 :].flatten(0, 1)
-        which = (drawn[:, None] == states).flatten(2).all(-1).float()
-        assert (which.sum(1) == 1).all()
-        shares.append(which.mean(0))
-    off, unkept = ((x - wanted).abs().sum() for x in shares)
-    assert off < 0.06 < 0.12 < unkept
+    net, uniform = _lively(coupled=True), torch.rand(6, 8, *_COUNTS.shape, generator=torch.Generator().manual_seed(2))
+    time = torch.full((6, 8), 1000.0)
+    for observed, same in ((None, True), (torch.zeros(6, 4, 6), False)):
+        whole = net.draw(observed, _given(6), _PLACES, _COUNTS, time, time, uniform)
+        rest = net.draw(observed, whole[:, 2], _PLACES, _COUNTS, time[:, 3:], time[:, 3:], uniform[:, 3:])
+        assert torch.equal(whole[:, 3:], rest) == same
 
 
 def _shipped(solvent: str | None = None) -> tuple[PeptideSlide, ChainFeatures, Any, torch.Tensor]:
@@ -140,8 +120,7 @@ def test_of_frames_far_apart_only_the_crowded_one_and_what_follows_is_drawn_agai
 
 
 def test_frames_far_apart_keep_populations_in_the_first_solvent_alone() -> None:
-    model, chain, *_ = _shipped()
-    assert model.endless(chain) is model.endless(chain) and model.endless(chain) is not None
+    model, *_ = _shipped()
     assert [model.keeps_populations(x) for x in (100.0, 101.0, 500.0, 501.0, 1000.0)] == [
         True,
         False,
@@ -149,6 +128,5 @@ def test_frames_far_apart_keep_populations_in_the_first_solvent_alone() -> None:
         True,
         True,
     ]
-    model, chain, *_ = _shipped("tip3p")
-    assert model.endless(chain) is None
+    model, *_ = _shipped("tip3p")
     assert [model.keeps_populations(x) for x in (20.0, 100.0, 1000.0)] == [True, False, False]
