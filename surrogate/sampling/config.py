@@ -31,7 +31,7 @@ class RolloutConfig:
     lag_ps: float | None = option(
         "Lag time of a surrogate step, for weights trained at several.",
         None,
-        unset="the longest that the save interval is a multiple of, of peptides up to 100ps",
+        unset="the longest that the save interval is a multiple of, of peptides 501ps to 1ns or up to 100ps",
     )
     solvent: str | None = option(
         "Solvent, for weights trained in several: obc2, tip3p.", None, unset="the first that they were trained in"

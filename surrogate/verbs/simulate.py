@@ -158,11 +158,11 @@ def rollout(
     this `level` of theory, and says which and why; 'gfn2-xtb' is of any drug-like molecule. Atoms are written in the
     scene's own order, frames at the interval of the weights or a multiple of it (`save_every_ps`), each marked with its
     chunk and validity. Weights that were trained for several lags step at `lag_ps`, by default at the longest that
-    `save_every_ps` is a multiple of (peptides: up to 100 ps, 20 ps in TIP3P); weights of several peptides take others
-    of the same residues, and of weights that were trained in several solvents `solvent` names one. Replicas run in one
-    batch, are named as by `reference` and joined as there. `solver`: 'multistep', 'fitted' (for few `solver_steps`, 2
-    to 10), 'euler' or the adaptive 'dopri5', None for the one that suits the weights. `precision`: 'fp32', 'bf16' or
-    'auto'.
+    `save_every_ps` is a multiple of (peptides: 501 ps to 1 ns or up to 100 ps, in TIP3P up to 20 ps); weights of
+    several peptides take others of the same residues, and of weights that were trained in several solvents `solvent`
+    names one. Replicas run in one batch, are named as by `reference` and joined as there. `solver`: 'multistep',
+    'fitted' (for few `solver_steps`, 2 to 10), 'euler' or the adaptive 'dopri5', None for the one that suits the
+    weights. `precision`: 'fp32', 'bf16' or 'auto'.
 
     Every frame is checked as it is made against what the training reference does. `guard` says what is done about one
     that fails: 'flag' marks it, 'resample' draws the chunk again, 'repair' relaxes it with OpenMM, 'fallback' runs real

@@ -1,9 +1,10 @@
-"""Rollouts of peptides with states drawn by the program and by torch.
+"""Frames a second of rollouts of peptides, and what makes them.
 
     python docs/studies/surrogates/state_draws.py [--sequence ACE-LEU-SER-NME] [--rounds 20]
 
-Chunks of one replica on one thread at lags of 10 ps, 100 ps and 1 ns, by either in turn: frames a second, the median of
-`--rounds` chunks, and the ratio.
+Chunks of one replica on one thread at lags of 10 ps, 100 ps and 1 ns, in turn: as they are drawn, with states drawn by
+torch instead of the program, and, as far as frames are drawn each on its own, one frame a chunk. The median of so many
+rounds, and the ratio.
 """
 
 from __future__ import annotations
@@ -12,29 +13,34 @@ import argparse
 import statistics
 import sys
 import time
+from typing import Any
 from unittest.mock import patch
 
+import numpy as np
+import numpy.typing as npt
 import torch
 
 from surrogate.bench.timing import machine_facts
 from surrogate.models.architecture import weights_path
 from surrogate.models.peptides import state_jumps
+from surrogate.models.peptides.model import PeptideSlide
 from surrogate.models.weights import load_weights
 from surrogate.sampling.chunks import ChunkSampler
 from surrogate.sampling.domain import fit_weights
 from systems.prepare.peptide import build_peptide
-from systems.scene import Scene
 
 LAGS_PS = 10.0, 100.0, 1000.0
+OTHERS: dict[str, Any] = {
+    "states by torch": patch.object(state_jumps, "_program", lambda: None),
+    "one frame a chunk": patch.object(PeptideSlide, "far_apart", lambda self, lag_ps: False),
+}
 
 
-def frames_per_s(sampler: ChunkSampler, scene: Scene, by_torch: bool, seed: int) -> float:
+def frames_per_s(sampler: ChunkSampler, last_nm: npt.NDArray[np.float64], seed: int) -> float:
     """Return the frames a second of one chunk."""
-    last = scene.positions_nm[None, None]
-    with patch.object(state_jumps, "_program", (lambda: None) if by_torch else state_jumps._program):
-        began = time.perf_counter()
-        sampler.draw(last, [seed])
-        return sampler.n_new / (time.perf_counter() - began)
+    began = time.perf_counter()
+    n_new = sampler.draw(last_nm, [seed]).frames_nm.shape[1]
+    return n_new / (time.perf_counter() - began)
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -44,16 +50,27 @@ def main(arguments: list[str] | None = None) -> None:
     args = parser.parse_args(arguments)
     torch.set_num_threads(1)
     weights, scene = load_weights(weights_path("peptides")), build_peptide(args.sequence)
+    last_nm = scene.positions_nm[None, None]
     sys.stdout.write(f"{args.sequence}, {machine_facts()['about']}\n")
     for lag_ps in LAGS_PS:
-        sampler = ChunkSampler(fit_weights(scene, weights, lag_ps=lag_ps, force=True)[0])
-        rates: tuple[list[float], list[float]] = [], []
+        fitted, _ = fit_weights(scene, weights, lag_ps=lag_ps, force=True)
+        model = fitted.model
+        assert isinstance(model, PeptideSlide)
+        sampler = ChunkSampler(fitted)
+        others = {name: how for name, how in OTHERS.items() if model.far_apart(lag_ps) or "torch" in name}
+        own: list[float] = []
+        rates: dict[str, list[float]] = {name: [] for name in others}
         for seed in range(1 + args.rounds):
-            for found, by_torch in zip(rates, (False, True), strict=True):
-                found.append(frames_per_s(sampler, scene, by_torch, seed))
-        program, by_torch_alone = (statistics.median(found[1:]) for found in rates)
-        ratio = program / by_torch_alone
-        sys.stdout.write(f"{lag_ps:6g} ps  program {program:7.1f}  torch {by_torch_alone:7.1f}  ratio {ratio:5.2f}\n")
+            own.append(frames_per_s(sampler, last_nm, seed))
+            for name, how in others.items():
+                with how:
+                    rates[name].append(frames_per_s(ChunkSampler(fitted), last_nm, seed))
+        usual = statistics.median(own[1:])
+        told = [f"{lag_ps:6g} ps: {usual:.0f} frames/s"]
+        for name, found in rates.items():
+            rate = statistics.median(found[1:])
+            told.append(f"{name} {rate:.0f} ({usual / rate:.2f} times)")
+        sys.stdout.write("; ".join(told) + "\n")
 
 
 if __name__ == "__main__":
