@@ -187,6 +187,7 @@ def test_steps_without_a_bath_are_those_of_openmm() -> None:
     assert np.abs(run.positions_nm[0] - relaxed("alanine-dipeptide")).max() > 5e-3
 
 
+@pytest.mark.slow
 def test_waters_without_forces_turn_for_ever() -> None:
     """Rounding in SETTLE had changed the kinetic energy by 2e-8 in each step, always the same way."""
     system = build_system(wet("alanine-dipeptide")[0], TIP3P)
@@ -221,6 +222,7 @@ def test_waters_stay_rigid_and_warm() -> None:
     assert abs(solute - 300.0) < 15.0 and abs(wet_k - 300.0) < 5.0
 
 
+@pytest.mark.slow
 def test_waters_trade_places_without_moving(monkeypatch: pytest.MonkeyPatch) -> None:
     """Each water's path is continuous under its name; places stay nearer to their sites than without trading."""
 

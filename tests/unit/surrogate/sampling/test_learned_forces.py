@@ -169,6 +169,7 @@ def test_annealed_replicas_start_all_over(tmp_path: Path, monkeypatch: pytest.Mo
         rollout(other.domain.scene, other, [tmp_path / "x.h5"], RolloutConfig(time_ps=0.1, anneal_ps=1.0))
 
 
+@pytest.mark.slow
 def test_a_short_annealing_ends_as_cold_as_a_long_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     loaded = load_weights(weights_path("paracetamol-gfn2-xtb"))
     scene = loaded.domain.scene
