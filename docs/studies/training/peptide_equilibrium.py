@@ -3,11 +3,11 @@
 `--weights W [--equilibrium E]`, and no MD. The probabilities of torsion states know equilibrium twice: as states at
 endless times, and as those in which steps end up. Both are learned from the same runs, yet differ, the first by less
 from MD of molecules never seen; those of E, by `peptide_states`, by less still. A copy of E is trained to keep these
-by steps of 1 ps to 1 ns, which are W's: of frames drawn at endless times as many are to go from one state of a torsion to another as come
-back (detailed balance), both together as many as before, and apart from that its probabilities are to stay what they
-were. Frames are those of `--molecules` of the wide campaign, of which the weights may know none; of its last ones,
-which play no part, the curves show how far it is from balance. It is the first solvent that is taught; signs of phi
-stay as they are. What is in OUT half done is gone on with.
+by steps of 1 ps to 1 ns, which are W's: of frames drawn at endless times as many are to go from one state of a torsion
+to another as come back (detailed balance), both together as many as before, and apart from that its probabilities are
+to stay what they were. Frames are those of `--molecules` of the wide campaign, of which the weights may know none; of
+its last ones, which play no part, the curves show how far it is from balance. It is the first solvent that is taught;
+signs of phi stay as they are. What is in OUT half done is gone on with.
 """
 
 from __future__ import annotations
