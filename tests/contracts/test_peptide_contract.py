@@ -136,7 +136,8 @@ def test_time_and_neighbours_and_chain_order_reach_the_flow() -> None:
 def test_a_long_lag_makes_shorter_chunks_and_none_beyond_what_was_trained() -> None:
     model = small_model()
     assert model.n_new == 5 and model.at_lag(200.0).n_new == 5 and model.at_lag(500.0).n_new == 2
-    assert model.at_lag(501.0).n_new == 20, "where no two frames fit, each is drawn on its own"
+    assert model.at_lag(501.0).n_new == 20, "frames so far apart are drawn each on its own"
+    assert small_model(longest_ps=20.0).at_lag(15.0).n_new == 1, "where training was of short times, they are not"
     with pytest.raises(InputError, match="2000 ps"):
         model.at_lag(2000.0)
 

@@ -53,8 +53,8 @@ def generators(noise: Tensor, place: int, attempt: int = 0) -> list[torch.Genera
 
 _MOST_CORRELATED = 0.995
 _LONGEST_WAVE = 4.0
-# As many times as many frames make a chunk where each is drawn on its own.
-_FAR_APART = 4
+# Frames further apart than this are drawn each on its own, and as many times as many make a chunk.
+_FAR_APART_PS, _FAR_APART_FRAMES = 500.0, 4
 # Chunks that disobey the states that were drawn for them, or whose atoms overlap, are drawn again so often.
 MAX_REDRAWS = 8
 # Where atoms overlap so many times, there may be no room for them in these states, and these are drawn again, too.
@@ -223,13 +223,12 @@ class PeptideSlide(Propagator):
     def n_new(self) -> int:
         assert self.lag_ps is not None
         most, within = self.config.chunk_frames, int(self.config.longest_ps / self.lag_ps * (1 + 1e-6))
-        return _FAR_APART * most if self.far_apart(self.lag_ps) else max(1, min(most, within))
+        return _FAR_APART_FRAMES * most if self.far_apart(self.lag_ps) else max(1, min(most, within))
 
     def far_apart(self, lag_ps: float) -> bool:
-        """Whether only one frame fits the longest time of training. Then all of a chunk count as the first after the
-        given frame, whose numbers say next to nothing of them, and their states follow from those of the frame before
-        alone."""
-        return 2.0 * lag_ps > self.config.longest_ps * (1 + 1e-6)
+        """Whether the numbers of a frame say next to nothing of the next. Then all frames of a chunk count as the first
+        after the given one, and states follow from those of the frame before alone."""
+        return lag_ps > _FAR_APART_PS * (1 + 1e-6)
 
     def keeps_populations(self, lag_ps: float) -> bool:
         in_first = self.solvent in (None, *self.config.solvents[:1])
