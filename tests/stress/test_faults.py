@@ -65,7 +65,7 @@ def undisturbed(tmp_path_factory: pytest.TempPathFactory, alanine_dipeptide: Sce
     return rollout(alanine_dipeptide, small_weights, outs, config)
 
 
-@pytest.mark.parametrize(("number", "times"), [(signal.SIGKILL, 8), (signal.SIGINT, 3), (signal.SIGTERM, 3)])
+@pytest.mark.parametrize(("number", "times"), [(signal.SIGKILL, 20), (signal.SIGINT, 5), (signal.SIGTERM, 5)])
 def test_stopped_at_random_moments_it_goes_on_bit_for_bit(
     number: signal.Signals, times: int, tmp_path: Path, alanine_dipeptide: Scene, small_weights: Weights,
     small_weights_file: Path, config: RolloutConfig, undisturbed: list[Path],

@@ -165,7 +165,7 @@ def teach(start: Path, out: Path, n_molecules: int, steps: int, equilibrium: Pat
     """Write weights that keep the equilibrium of those of `start`, or of others. Raises SimulationError when training
     diverges."""
     weights, source = load_weights(start), load_weights(equilibrium or start)
-    copied = load_weights(equilibrium or start)
+    copied = load_weights(source.path)
     teacher, endless_teacher, model = (cast(PeptideSlide, w.model) for w in (weights, source, copied))
     model.requires_grad_(True)
     sequences = [peptide.sequence for peptide in wide_peptides()]

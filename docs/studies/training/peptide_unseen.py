@@ -14,7 +14,7 @@ read). Over MD's own:
 - kinetics: integrated correlation times of every cos ψ and along the two slowest TICA coordinates of MD;
 - lags: root mean square difference of the populations of torsion states at 100 ps and 1 ns from those at 10 ps;
 - populations of torsion states: root mean square difference from MD's, of rollouts, of frames that the weights draw
-  at endless times, each by itself, and of one half of MD's runs from the other; in TIP3P levels that set populations
+  at endless times, and of one half of MD's runs from the other; in TIP3P levels that set populations
   (`peptide_populations`) move those at endless times half as far as those of steps;
 - free chains of four, by MDGen's recipe: every other run to the remaining runs of MD, the model's over MD's.
 A φ > 0 that MD enters fewer than ten times plays no part: frames that show it are left out of distances, as are pairs

@@ -6,7 +6,8 @@ is lost. The flow runs on innovations: of each coordinate at time t after the co
 with that frame leaves to learn, (z_t - ρ(t) z_0) / sqrt(1 - ρ(t)²), which has unit variance at any t. Each frame of a
 chunk has its own time, so that one model serves all spacings. The states of torsions with barriers are drawn first;
 their numbers count from the mean of those in their state. Frames that leave these states a little, or in which atoms
-overlap, are mended by small turns; chunks with frames where that is not enough are drawn again.
+overlap, are mended by small turns; chunks with frames where that is not enough are drawn again, and of frames far
+apart, which do not depend on one another, these alone.
 """
 
 from __future__ import annotations
@@ -365,14 +366,14 @@ class PeptideSlide(Propagator):
                 again = drawn[rows]
                 again[..., filled] = torch.stack([torch.randn(fresh, generator=g) for g in seeds]).to(again)
                 drawn[rows] = torch.where(todo[rows][..., None, None], again, drawn[rows])
-            # Frames far apart are drawn each on its own, else chunks.
-            whole = rows[:, None], torch.arange(n_new, device=device)[None]
-            row, _ = at = torch.nonzero(todo)[..., None].unbind(1) if far_apart else whole
+            # Frames far apart are drawn each on its own, else whole chunks.
+            start, frame = torch.nonzero(todo).T if far_apart else (rows, torch.arange(n_new, device=device))
+            at = start[:, None], frame[:, None] if far_apart else frame
             tokens, n = self.solved(
-                observed[row[:, 0]], now[row[:, 0]], states[at], times[at], chain, drawn[at],
+                observed[start], now[start], states[at], times[at], chain, drawn[at],
                 solver=solver, solver_steps=solver_steps,
             )  # fmt: skip
-            evaluations += n * len(row) * tokens.shape[1] / todo.numel()
+            evaluations += n * len(start) * tokens.shape[1] / todo.numel()
             resolved = mended(tokens.flatten(0, 1), states[at].flatten(0, 1), chain)
             placed, astray, crowded[at] = (x.unflatten(0, tokens.shape[:2]) for x in resolved)
             frames[at] = self._laid(placed, chain)

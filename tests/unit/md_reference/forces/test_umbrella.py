@@ -98,7 +98,6 @@ def test_files_hold_the_energies_without_it_and_its_own(tmp_path: Path, platform
 
 
 @needs_compiler
-@pytest.mark.slow
 def test_weighted_frames_are_those_of_equilibrium(tmp_path: Path) -> None:
     """ψ crosses more often, and its populations, weighted, are those of MD without an umbrella: at 500 K, where
     chance moves them apart by 0.02."""

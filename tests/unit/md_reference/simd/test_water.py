@@ -187,7 +187,6 @@ def test_steps_without_a_bath_are_those_of_openmm() -> None:
     assert np.abs(run.positions_nm[0] - relaxed("alanine-dipeptide")).max() > 5e-3
 
 
-@pytest.mark.slow
 def test_waters_without_forces_turn_for_ever() -> None:
     """Rounding in SETTLE had changed the kinetic energy by 2e-8 in each step, always the same way."""
     system = build_system(wet("alanine-dipeptide")[0], TIP3P)

@@ -257,7 +257,7 @@ def test_md_begins_at_frames_of_the_rollout_and_does_so_again(tmp_path: Path, mo
 
 
 @needs_compiler
-@pytest.mark.parametrize("good_frames", [0, pytest.param(5, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("good_frames", [0, 5])
 def test_where_simd_blow_up_openmm_goes_on_and_nothing_is_lost(
     good_frames: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

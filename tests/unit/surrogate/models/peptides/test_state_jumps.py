@@ -10,7 +10,7 @@ import torch
 from surrogate.models.architecture import weights_path
 from surrogate.models.peptides import model as model_module
 from surrogate.models.peptides import state_jumps
-from surrogate.models.peptides.chains import MOST_STATES, MOST_TORSIONS, ChainFeatures, mended
+from surrogate.models.peptides.chains import MOST_STATES, mended
 from surrogate.models.peptides.model import PeptideSlide
 from surrogate.models.peptides.state_jumps import StateJumps
 from surrogate.models.weights import load_weights
@@ -18,13 +18,7 @@ from surrogate.sampling.domain import under_conditions
 from systems.prepare.peptide import build_peptide
 
 _PLACES = torch.tensor([[2, 0, 3], [3, 2, 2], [2, 3, 3], [3, 2, 1]])
-_COUNTS = torch.zeros(4, MOST_TORSIONS, dtype=torch.long)
-_COUNTS[0, 1], _COUNTS[1, :3], _COUNTS[2, :2], _COUNTS[3, [0, 1, 3]] = (
-    2,
-    torch.tensor([2, 2, 3]),
-    2,
-    torch.tensor([2, 2, 3]),
-)
+_COUNTS = torch.tensor([[0, 2, 0, 0, 0, 0, 0], [2, 2, 3, 0, 0, 0, 0], [2, 2, 0, 0, 0, 0, 0], [2, 2, 0, 3, 0, 0, 0]])
 
 
 def _lively(*, coupled: bool) -> StateJumps:
@@ -66,7 +60,7 @@ def test_the_program_draws_what_torch_draws(monkeypatch: pytest.MonkeyPatch, cou
     theirs = [net.draw(*call) for call in calls]
     for x, y in zip(ours, theirs, strict=True):
         # A number may lie between two roundings of a probability, and what follows in that row differs.
-        assert (x == y).flatten(1).all(1).sum() >= rows - 2
+        assert (x == y).flatten(1).all(1).sum() >= rows - 1
         assert (x[:, 1:] != x[:, :-1]).any() and not x[..., _COUNTS == 0].any()
 
 
@@ -85,21 +79,19 @@ def test_of_frames_far_apart_each_follows_from_the_states_before_alone(
         assert torch.equal(whole[:, 3:], rest) == same
 
 
-def _shipped(solvent: str | None = None) -> tuple[PeptideSlide, ChainFeatures, Any, torch.Tensor]:
+def _shipped(solvent: str) -> PeptideSlide:
     weights = load_weights(weights_path("peptides"))
-    model = under_conditions(weights, {"solvent": solvent} if solvent else {}).model.at_lag(1000.0)
+    model = under_conditions(weights, {"solvent": solvent}).model.at_lag(1000.0)
     assert isinstance(model, PeptideSlide)
-    scene = build_peptide("ACE-ALA-NME")
-    molecule = model.featurise(scene)
-    return model, molecule.own, molecule, torch.tensor(scene.positions_nm).float()[None, None]
+    return model
 
 
 def test_of_frames_far_apart_only_the_crowded_one_and_what_follows_is_drawn_again(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """A frame of the second row is said to overlap until its states are drawn again: these and all after it change."""
-    model, _, molecule, start = _shipped()
-    last, at = start.expand(2, -1, -1, -1), 5
+    model, scene, at = _shipped("obc2"), build_peptide("ACE-ALA-NME"), 5
+    molecule, last = model.featurise(scene), torch.tensor(scene.positions_nm).float().expand(2, 1, -1, -1)
     noise = torch.randn(2, *model.noise_shape(molecule.n_atoms), generator=torch.Generator().manual_seed(3))
     plain = model.next_chunk(last, molecule, noise, solver_steps=2)
     sizes: list[int] = []
@@ -120,13 +112,6 @@ def test_of_frames_far_apart_only_the_crowded_one_and_what_follows_is_drawn_agai
 
 
 def test_frames_far_apart_keep_populations_in_the_first_solvent_alone() -> None:
-    model, *_ = _shipped()
-    assert [model.keeps_populations(x) for x in (100.0, 101.0, 500.0, 501.0, 1000.0)] == [
-        True,
-        False,
-        False,
-        True,
-        True,
-    ]
-    model, *_ = _shipped("tip3p")
-    assert [model.keeps_populations(x) for x in (20.0, 100.0, 1000.0)] == [True, False, False]
+    lags_ps = 20.0, 100.0, 101.0, 500.0, 501.0, 1000.0
+    kept = {solvent: [x for x in lags_ps if _shipped(solvent).keeps_populations(x)] for solvent in ("obc2", "tip3p")}
+    assert kept == {"obc2": [20.0, 100.0, 501.0, 1000.0], "tip3p": [20.0]}
