@@ -13,9 +13,10 @@ import peptide_states
 import pytest
 import torch
 from peptide_campaign import light_umbrella
+from peptide_energies import trained_with
 from peptide_equilibrium import Equilibrium
 from peptide_list import held_out_peptides, training_peptides, unseen_peptides, wide_peptides
-from peptide_states import DRAWS, Md, drawn, errors, gather, parted, read, shares, teach
+from peptide_states import DRAWS, Md, drawn, errors, gather, parted, positive_phi_errors, read, shares, teach, together
 
 from md_reference.forces.umbrella import Umbrella
 from surrogate.models.architecture import weights_path
@@ -132,3 +133,29 @@ def test_weights_learn_states_at_endless_times(tmp_path: Path, monkeypatch: pyte
     both = [m.state_dict() for m in (begun, model)]
     assert {k.split(".")[0] for k in both[0] if not torch.equal(both[0][k], both[1][k])} == {"jumps"}
     assert shares(md.laid(chain), chain)[0, 1] == pytest.approx(0.9, abs=0.02)
+
+
+def test_psi_two_apart_that_turn_together_and_a_positive_phi_that_is_too_rare_are_seen(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(peptide_states, "_SIGNED_FRAMES", 500)
+    start = load_weights(weights_path("peptides"))
+    model, rng = cast(PeptideSlide, start.model), np.random.default_rng(0)
+    chain = chain_features(build_peptide("ACE-ALA-SER-LEU-NME"), model.config)
+    places = zip(chain.stated.residue.tolist(), chain.stated.slot.tolist(), strict=True)
+    at = {place: k for k, place in enumerate(places)}
+    states = np.zeros((2, DRAWS, len(at)), np.uint8)
+    states[..., at[1, 1]] = rng.random((2, DRAWS)) < 0.5
+    # Of three psi the third is as the first, nine times of ten; frames with a phi > 0 do not count.
+    states[..., at[3, 1]] = states[..., at[1, 1]] ^ (rng.random((2, DRAWS)) < 0.1)
+    states[0, :, at[2, 0]] = 1
+    states[0, :, at[3, 1]] = states[0, :, at[1, 1]]
+    states[..., at[2, 1]] = rng.random((2, DRAWS)) < 0.5
+    found = together(Md("ALA-SER-LEU", states).laid(chain), chain)
+    assert found[2] == pytest.approx([0.8], abs=0.04) and found[1] == pytest.approx([0.0, 0.0], abs=0.06)
+    energies = {"SER": trained_with(start.provenance)["SER"]}
+    usual = positive_phi_errors(model, energies)
+    with torch.no_grad():
+        model.jumps.of_change[0, 2 + model.config.types.index("SER"), 0, 0, 1] -= 2.0
+    rarer = {time: mean - usual[time][0] for time, (mean, _) in positive_phi_errors(model, energies).items()}
+    assert rarer == pytest.approx(dict.fromkeys(usual, 2.0), abs=0.6)

@@ -26,8 +26,8 @@ import peptide_water
 import pytest
 import torch
 from peptide_correction import CELLS, Correction
-from peptide_energies import wham
-from peptide_equilibrium import Equilibrium, step, teach
+from peptide_energies import trained_with, wham
+from peptide_equilibrium import Equilibrium, positive_phis, set_signs, step, teach
 from peptide_list import (
     FURTHER_PAIRS,
     RESIDUES,
@@ -369,7 +369,7 @@ def test_no_training_takes_what_is_tested_by(tmp_path: Path) -> None:
     orders = [peptide_campaign.order(solvent) for solvent in ("obc2", "tip3p")]
     tested = {p.residues for order in orders for kind, p, _ in order if kind == "test" and len(p.residues) > 1}
     assert not tested & {p.residues for order in orders for kind, p, _ in order if kind != "test"}
-    assert peptide_transfer.trained_with({"from": {"from": {"positive_phi_kt": {"ALA": 4.0}}}}) == {"ALA": 4.0}
+    assert trained_with({"from": {"from": {"positive_phi_kt": {"ALA": 4.0}}}}) == {"ALA": 4.0}
 
 
 def test_a_correction_weighs_frames_by_their_residues_maps(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
@@ -395,10 +395,11 @@ def test_a_correction_weighs_frames_by_their_residues_maps(monkeypatch: pytest.M
 def test_steps_are_taught_to_keep_what_is_drawn_at_endless_times(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """By other weights, by which psi of alanine is in its second state more often."""
+    """By other weights, by which psi of alanine is in its second state more often, and phi > 0 as free energies say."""
     some = wide_peptides()[:2]
     for name, value in {"_FRAMES": 300, "_HELD": 1, "_RATE": 2e-2, "wide_peptides": lambda: some}.items():
         monkeypatch.setattr(peptide_equilibrium, name, value)
+    monkeypatch.setattr(peptide_equilibrium, "trained_with", lambda provenance: {"ALA": 2.5})
     shipped = load_weights(weights_path("peptides"))
     begun, other = (cast(PeptideSlide, load_weights(weights_path("peptides")).model) for _ in range(2))
     with torch.no_grad():
@@ -407,20 +408,28 @@ def test_steps_are_taught_to_keep_what_is_drawn_at_endless_times(
     provenance = {"umbrella_states": 5}
     save_weights(source := tmp_path / "other.safetensors", other, shipped.domain, provenance, half=True)
     found = load_weights(teach(shipped.path, tmp_path / "taught.safetensors", 1, 100, source))
-    taught, frames = cast(PeptideSlide, found.model), Equilibrium.of(other, "ACE-ALA-NME", 1, 800)
+    taught = cast(PeptideSlide, found.model)
     assert found.provenance["umbrella_states"] == 5 and found.provenance["from"]["hash"] == shipped.hash
+    set_signs(other, ["ACE-ALA-NME"], {"ALA": 2.5})
+    frames = Equilibrium.of(other, "ACE-ALA-NME", 1, 800)
+    phi, psi = 0, 1
 
-    def of_psi(model: PeptideSlide, time_ps: float) -> tuple[float, float]:
+    def of(which: int, model: PeptideSlide, time_ps: float) -> tuple[float, float]:
         """How many more go to the second state than come back, and how many more of both than by the shipped ones."""
         rows, generator = torch.arange(len(frames.states)), torch.Generator().manual_seed(0)
         found = step(model, begun, frames, rows, torch.tensor([time_ps]), generator)
-        return float(found.unbalanced[:, 0].mean()), float(found.faster[:, 0].mean())
+        return float(found.unbalanced[:, which].mean()), float(found.faster[:, which].mean())
 
-    assert of_psi(begun, 10.0)[0] < -0.8
-    assert abs(of_psi(taught, 10.0)[0]) < 0.3 and abs(of_psi(taught, 10.0)[1]) < 0.3
+    assert of(psi, begun, 10.0)[0] < -0.8 and of(phi, begun, 10.0)[0] < -1.0
+    for which in (phi, psi):
+        assert abs(of(which, taught, 10.0)[0]) < 0.3 and abs(of(which, taught, 10.0)[1]) < 0.3
     endless = begun.config.forgotten_ps
-    assert abs(of_psi(other, endless)[0]) < 0.3 and abs(of_psi(taught, endless)[0]) < 0.3
-    assert of_psi(begun, endless)[0] < -0.8
+    assert abs(of(psi, other, endless)[0]) < 0.3 and abs(of(psi, taught, endless)[0]) < 0.3
+    assert of(psi, begun, endless)[0] < -0.8
+    weights = frames.weights / frames.weights.sum()
+    p = {model: float(weights @ positive_phis(model, frames, endless)[:, 0]) for model in (begun, other, taught)}
+    assert -math.log(p[other] / (1 - p[other])) == pytest.approx(2.5, abs=0.1)
+    assert p[begun] < 0.5 * p[other] and p[taught] == pytest.approx(p[other], rel=0.3)
     moved = {k.split(".")[0] for k, x in taught.state_dict().items() if not torch.equal(x, begun.state_dict()[k])}
     assert moved == {"jumps"}
 

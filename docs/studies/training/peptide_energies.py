@@ -136,6 +136,15 @@ def known_energies(folder: Path) -> dict[str, float]:
     return found
 
 
+def trained_with(provenance: dict[str, Any] | None) -> dict[str, float]:
+    """Return the free energies of φ > 0 that weights, or those that they began with, were trained with."""
+    while provenance is not None:
+        if found := provenance.get("positive_phi_kt"):
+            return dict(found)
+        provenance = provenance.get("from")
+    return {}
+
+
 def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folder", type=Path)

@@ -5,16 +5,17 @@ endless times, and as those in which steps end up. Both are learned from the sam
 from MD of molecules never seen; those of E, by `peptide_states`, by less still. A copy of E is trained to keep these
 by steps of 1 ps to 1 ns, which are W's: of frames drawn at endless times as many are to go from one state of a torsion
 to another as come back (detailed balance), both together as many as before, and apart from that its probabilities are
-to stay what they were. Frames are those of `--molecules` of the wide campaign, of which the weights may know none; of
-its last ones, which play no part, the curves show how far it is from balance. It is the first solvent that is taught;
-signs of phi stay as they are. What is in OUT half done is gone on with.
+to stay what they were. How likely phi > 0 is at endless times is set first, to the free energies that W was trained
+with (`peptide_energies`); how often it is left stays what it was. Frames are those of `--molecules` of the wide
+campaign, of which the weights may know none; of its last ones, which play no part, the curves show how far it is from
+balance. It is the first solvent that is taught. What is in OUT half done is gone on with.
 """
 
 from __future__ import annotations
 
 import argparse
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import cache
 from itertools import combinations
 from pathlib import Path
@@ -23,10 +24,12 @@ from typing import NamedTuple, cast
 import numpy as np
 import torch
 import torch.nn.functional as F
-from peptide_list import wide_peptides
+from peptide_energies import trained_with
+from peptide_list import RESIDUES, wide_peptides
 from torch import Tensor
 
 from surrogate.models.architecture import weights_path
+from surrogate.models.peptides.balance import levels_of_types
 from surrogate.models.peptides.chains import MOST_STATES, ChainFeatures, mended
 from surrogate.models.peptides.layout import chain_features
 from surrogate.models.peptides.model import PeptideSlide, times_apart
@@ -42,6 +45,8 @@ _WINDOWS, _ENDLESS_SHARE, _ENDLESS_FRAMES = 256, 0.15, 4
 # What detailed balance counts beside what probabilities were, the square of a logarithm beside a divergence; states in
 # which fewer frames are say nothing, and how far, squared, sequences differ.
 _BALANCE, _LEAST_FRAMES, _DIFFER = 3.0, 3.0, 0.05
+# Molecules of several residues by which signs of phi are set, how often, and what holds their levels near zero.
+_SIGNED, _SIGNED_FRAMES, _PASSES, _RIDGE = 120, 128, 2, 0.3
 _RATE, _HELD, _VALIDATE_S, _VALIDATED = 6e-4, 16, 120.0, ((10.0, 8), (100.0, 8), (1000.0, 1))
 
 
@@ -90,6 +95,36 @@ class Equilibrium(NamedTuple):
         return Equilibrium(chain, frames, *model.normalised(frames, chain), counting)
 
 
+@torch.no_grad()
+def positive_phis(model: PeptideSlide, frames: Equilibrium, time_ps: float) -> Tensor:
+    """Return how likely each phi that has signs is positive so long after each frame, `(n, n_signed)`."""
+    chain, counts, n = frames.chain, frames.chain.stated.counts, len(frames.states)
+    times = torch.full((n, 1), time_ps)
+    uniform = torch.rand(n, 1, *counts.shape, generator=torch.Generator().manual_seed(0))
+    shares = uniform.new_zeros(*uniform.shape, MOST_STATES)
+    given = frames.observed, frames.states, chain.places, counts, times, times
+    model.jumps_of(chain).draw(*given, uniform, shares)
+    return shares[:, 0, chain.signed, 0, 1]
+
+
+def set_signs(model: PeptideSlide, sequences: Sequence[str], positive_phi_kt: Mapping[str, float]) -> None:
+    """Move how likely phi > 0 is at endless times, by levels of types, to what free energies of residues say in the
+    mean over molecules."""
+    for _ in range(_PASSES):
+        types, lacking = [], []
+        for frames in (Equilibrium.of(model, sequence, n_frames=_SIGNED_FRAMES) for sequence in sequences):
+            chain, endless = frames.chain, model.config.forgotten_ps
+            likely = (frames.weights / frames.weights.sum()) @ positive_phis(model, frames, endless)
+            for residue, found in zip(chain.signed, likely.logit().tolist(), strict=True):
+                kt = positive_phi_kt.get(chain.code.layout.types[residue])
+                if kt is not None:
+                    types.append(chain.places[residue, :3].tolist())
+                    lacking.append(-kt - found)
+        levels = levels_of_types(model.jumps, types, lacking, _RIDGE)
+        model.jumps.raise_change(0, 0, 1, levels)
+        model.jumps.raise_change(0, 1, 0, -levels)
+
+
 class Step(NamedTuple):
     """Of windows, how far probabilities are from the teacher's (Kullback-Leibler divergence per frame and torsion); and
     of every two states of a torsion, by either half of the windows, the logarithms of how many more go one way than the
@@ -130,12 +165,12 @@ def step(
         # States that a torsion lacks are infinitely unlikely to both.
         target, ours = (x.log_softmax(-1).masked_fill(torch.isinf(wanted), 0.0) for x in (wanted, logits))
         divergence = divergence + (wanted.softmax(-1) * (target - ours)).sum()
-        moving = [k for k, r in enumerate(has.tolist()) if torsion or r not in chain.signed]
-        before = F.one_hot(states[:, :-1, has[moving], torsion], MOST_STATES).float()
+        signs = torch.tensor([not torsion and r in chain.signed for r in has.tolist()])
+        before = F.one_hot(states[:, :-1, has, torsion], MOST_STATES).float()
         # Fluxes (2, n, from, to) of either half, and as many frames as the weights of those in a state are worth.
         flux, known = (
             torch.stack([torch.einsum("btna,btnc,b->nac", before[k::2], x[k::2], weights[k::2]) for k in (0, 1)])
-            .clamp(min=1e-9).log() for x in (logits[:, :, moving].softmax(-1), wanted[:, :, moving].softmax(-1))
+            .clamp(min=1e-9).log() for x in (logits.softmax(-1), wanted.softmax(-1))
         )  # fmt: skip
         worth = torch.stack([
             torch.einsum("bna,b->na", before[k::2, 0], weights[k::2]).square()
@@ -144,7 +179,9 @@ def step(
         for a, b in combinations(range(MOST_STATES), 2):
             enough = torch.minimum(worth[..., a], worth[..., b]).amin(0) >= _LEAST_FRAMES
             both = flux[..., a, b], flux[..., b, a]
-            faster = (sum(both) - known[..., a, b] - known[..., b, a]) / 2
+            # How often phi > 0 is entered no run tells: only how often it is left is to stay.
+            pace = torch.where(signs, known[..., b, a], (known[..., a, b] + known[..., b, a]) / 2)
+            faster = sum(both) / 2 - pace
             counted = _DIFFER / (_DIFFER + 1.0 / worth[..., a].sum(0) + 1.0 / worth[..., b].sum(0))
             found.append(torch.cat([both[0] - both[1], faster, counted[None]])[:, enough])
     n, each = times.numel() * max(1, int((counts > 0).sum())), torch.cat(found, dim=1)
@@ -171,6 +208,10 @@ def teach(start: Path, out: Path, n_molecules: int, steps: int, equilibrium: Pat
     sequences = [peptide.sequence for peptide in wide_peptides()]
     trained, held = sequences[:-_HELD], sequences[-_HELD:]
     trained = trained[:: max(1, len(trained) // n_molecules)][:n_molecules]
+    energies = trained_with(weights.provenance)
+    if energies:
+        set_signs(endless_teacher, [*sequences[: len(RESIDUES)], *trained[:: max(1, n_molecules // _SIGNED)]], energies)
+        model.jumps.load_state_dict(endless_teacher.jumps.state_dict())
 
     @cache
     def frames_of(sequence: str) -> Equilibrium:

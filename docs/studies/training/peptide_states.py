@@ -9,7 +9,9 @@ CAMPAIGN is a folder of `peptide_campaign --umbrella --solvent obc2`. `record` a
 at equilibrium. Nothing else is kept of this MD, and the campaign leaves out what the record holds. `teach` trains the
 probabilities at endless times on it, but those of the signs of phi; of molecules that WEIGHTS were trained on they are
 to stay what they were. One molecule in eight is left out. `compare` says how far populations at endless times are from
-those of MD, of molecules left out and learned. Weights so taught are for endless times alone: `peptide_equilibrium`
+those of MD, of molecules left out and learned, and how much psi of residues one and two apart are in one state together
+(the mean correlation); and how rare phi > 0 is by steps, beside free energies that weights were trained with
+(`peptide_energies`). Weights so taught are for endless times alone: `peptide_equilibrium`
 teaches steps to keep what they draw.
 """
 
@@ -29,7 +31,8 @@ import numpy as np
 import numpy.typing as npt
 import torch
 import torch.nn.functional as F
-from peptide_equilibrium import Equilibrium, step
+from peptide_energies import trained_with
+from peptide_equilibrium import Equilibrium, positive_phis, step
 from peptide_list import held_out_peptides, training_peptides, unseen_peptides, wide_peptides
 from torch import Tensor
 
@@ -51,6 +54,10 @@ LEFT_OUT = 8
 _WINDOWS, _TIMES, _RATE, _DROPPED, _VALIDATE_S = 256, 4, 5e-4, 0.2, 600.0
 # Frames of a molecule that endless times are counted from: little of them is left by then.
 _STARTS = 128
+# Where psi stands among torsions, and how far apart residues are whose psi are looked at together. Steps by which
+# phi > 0 is looked at, and frames of each residue for it.
+_PSI, _APART = 1, (1, 2)
+_STEPS_PS, _SIGNED_FRAMES = (10.0, 100.0, 1000.0), 3000
 # The share of training that keeps what is drawn of so many molecules known before.
 _KEEPING, _KNOWN = 0.4, 40
 
@@ -133,23 +140,58 @@ def shares(states: Tensor, chain: ChainFeatures) -> Tensor:
     return F.one_hot(own, MOST_STATES).double().mean(dim=0)
 
 
+def together(states: Tensor, chain: ChainFeatures) -> dict[int, list[float]]:
+    """Return the correlations of the states of psi of residues one and two apart, by how far, of `states` (n,
+    n_residues, MOST_TORSIONS) with every phi negative."""
+    kept, psi = states[(states[..., 0] == 0).all(dim=1)][..., _PSI].double(), chain.stated.counts[:, _PSI] > 1
+    return {
+        apart: [float(torch.corrcoef(kept[:, [r, r + apart]].T)[0, 1].nan_to_num())
+                for r in range(len(psi) - apart) if psi[r] and psi[r + apart]] for apart in _APART
+    }  # fmt: skip
+
+
 @torch.no_grad()
 def errors(model: PeptideSlide, some: Iterable[tuple[Md, Equilibrium]]) -> dict[str, float]:
     """Return how far shares of states at endless times are from MD's, root mean square less MD's own error, and that
-    error, %."""
+    error, %; and the mean correlations of `together`, ours and MD's, nan where no two residues are so far apart."""
     off, own, n = 0.0, 0.0, 0
+    both: dict[str, list[float]] = {f"{whose} {apart}": [] for apart in _APART for whose in ("ours", "MD's")}
     for md, frames in some:
         chain, generator = frames.chain, torch.Generator().manual_seed(0)
         rows = torch.multinomial(frames.weights, 2 * DRAWS, True, generator=generator)
         times = torch.full((2 * DRAWS, 1), model.config.forgotten_ps)
         uniform = torch.rand(len(rows), 1, *chain.stated.counts.shape, generator=generator)
         given = frames.observed[rows], frames.states[rows], chain.places, chain.stated.counts, times, times
-        ours = shares(model.jumps_of(chain).draw(*given, uniform)[:, 0], chain)
+        drawn_states = model.jumps_of(chain).draw(*given, uniform)[:, 0]
+        for whose, states in (("ours", drawn_states), ("MD's", md.laid(chain))):
+            for apart, found in together(states, chain).items():
+                both[f"{whose} {apart}"] += found
+        ours = shares(drawn_states, chain)
         first, second = (shares(x, chain) for x in md.laid(chain).split(DRAWS))
         off += float((ours - (first + second) / 2).square().sum())
         own += float((first - second).square().sum()) / 4
         n += int(chain.stated.counts[chain.stated.counts > 0].sum()) - 2 * int((chain.stated.slot == 0).sum())
-    return {"off": 100.0 * math.sqrt(max(0.0, off - own) / n), "own": 100.0 * math.sqrt(own / n)}
+    correlations = {name: float(np.mean(x)) if x else math.nan for name, x in both.items()}
+    return {"off": 100.0 * math.sqrt(max(0.0, off - own) / n), "own": 100.0 * math.sqrt(own / n), **correlations}
+
+
+def positive_phi_errors(model: PeptideSlide, energies: dict[str, float]) -> dict[str, tuple[float, float]]:
+    """Return, by how long steps are, how much rarer phi > 0 is than its free energies say where as many enter it as
+    leave it, in the mean over residues between caps, and root mean square, kT."""
+    off: dict[str, list[float]] = {f"{time_ps:g} ps": [] for time_ps in _STEPS_PS}
+    for name, kt in energies.items():
+        frames = Equilibrium.of(model, f"ACE-{name}-NME", n_frames=_SIGNED_FRAMES)
+        positive = frames.states[:, frames.chain.signed[0], 0] == 1
+        for time_ps in _STEPS_PS:
+            after = positive_phis(model, frames, time_ps)[:, 0]
+            entered, left = (
+                (frames.weights[side] @ x[side]) / frames.weights[side].sum()
+                for side, x in ((~positive, after), (positive, 1.0 - after))
+            )
+            off[f"{time_ps:g} ps"].append(float((left / entered).log()) - kt)
+    return {
+        name: (float(np.nanmean(x)), float(np.sqrt(np.nanmean(np.square(x))))) for name, x in off.items()
+    }  # fmt: skip
 
 
 def parted(some: Sequence[Md]) -> tuple[list[Md], list[Md]]:
@@ -245,8 +287,14 @@ def main(arguments: Sequence[str] | None = None) -> None:
                 some = [md for md in part if md.kind == kind]
                 found = errors(model, ((md, Equilibrium.of(model, md.sequence, n_frames=_STARTS)) for md in some))
                 off, own = found["off"], found["own"]
-                sys.stdout.write(f"{len(some)} {kind} {name}: off by {off:.1f} %, MD's error {own:.1f} %\n")
+                line = f"{len(some)} {kind} {name}: off by {off:.1f} %, MD's error {own:.1f} %"
+                for apart in _APART:
+                    ours, theirs = (found[f"{whose} {apart}"] for whose in ("ours", "MD's"))
+                    line += f"; psi {apart} apart correlate {ours:.3f}, MD's {theirs:.3f}"
+                sys.stdout.write(line + "\n")
                 sys.stdout.flush()
+        for time, (mean, rms) in positive_phi_errors(model, trained_with(start.provenance)).items():
+            sys.stdout.write(f"phi > 0 by steps of {time}: rarer by {mean:.2f} kT, root mean square {rms:.2f} kT\n")
 
 
 if __name__ == "__main__":

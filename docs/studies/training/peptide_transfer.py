@@ -24,11 +24,11 @@ from collections.abc import Sequence
 from copy import deepcopy
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, cast
+from typing import cast
 
 import numpy as np
 from peptide_campaign import order
-from peptide_energies import known_energies
+from peptide_energies import known_energies, trained_with
 from peptide_list import RESIDUES, held_out_peptides, unseen_peptides
 from processes import is_trained
 
@@ -70,15 +70,6 @@ def sets_of(folders: Sequence[Path], runs: int = 10_000) -> list[TrainingFrames]
     if not found:
         raise InputError(f"{', '.join(map(str, folders))} hold no runs.")
     return found
-
-
-def trained_with(provenance: dict[str, Any] | None) -> dict[str, float]:
-    """Return the free energies of φ > 0 that weights, or those that they began with, were trained with."""
-    while provenance is not None:
-        if found := provenance.get("positive_phi_kt"):
-            return dict(found)
-        provenance = provenance.get("from")
-    return {}
 
 
 def rolled_in_water(start: Weights, folder: Path) -> Path:

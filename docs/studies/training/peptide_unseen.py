@@ -42,10 +42,10 @@ import numpy as np
 import numpy.typing as npt
 import torch
 from peptide_campaign import IMPLICIT, WATER, dynamics, minimised
+from peptide_energies import trained_with
 from peptide_reference import RECORD, Reference, references
 from peptide_rollouts import FRAMES_PS, frame_weights, rolled, thinned
 from peptide_scores import Turn, angles, library, rarely_positive, turns_of
-from peptide_transfer import trained_with
 
 from md_reference.forces.forcefield import build_system
 from md_reference.forces.solvation import solvate

@@ -114,7 +114,9 @@ def _balance(model: PeptideSlide, jumps: StateJumps, subjects: Sequence[PeptideS
     phis = [phi for subject in subjects for phi in weighted_phis(model, subject)]
     types = [phi.chain.places[phi.residue, :3].tolist() for phi in phis]
     for _ in range(_PASSES if phis else 0):
-        jumps.raise_change(0, 0, 1, _levels(jumps, types, [lacking_entries(model, phi) for phi in phis], _RIDGE))
+        jumps.raise_change(
+            0, 0, 1, levels_of_types(jumps, types, [lacking_entries(model, phi) for phi in phis], _RIDGE)
+        )
 
 
 @torch.no_grad()
@@ -206,7 +208,9 @@ def raise_populations(model: PeptideSlide, solvent: int, levels: Mapping[tuple[i
         jumps.raise_change(torsion, b, a, -each.to(jumps.of_change.device) / 2)
 
 
-def _levels(jumps: StateJumps, types: Sequence[Sequence[int]], lacking: Sequence[float], ridge: float) -> Tensor:
+def levels_of_types(
+    jumps: StateJumps, types: Sequence[Sequence[int]], lacking: Sequence[float], ridge: float
+) -> Tensor:
     """Return levels `(3, n_types)` of residues, of those before and of those after, whose sums come nearest to what is
     `lacking` where residues have these `types` (n, 3)."""
     has = F.one_hot(torch.tensor(types), jumps.of_change.shape[1]).flatten(1).double()

@@ -18,7 +18,7 @@ struct Block {
 struct Net {
     int64_t n_residues, coupled;
     const int64_t *counts;          // (residues, TORSIONS)
-    Linear given[3], before[3], earlier, beside[2], fresh[TORSIONS], hidden, logits;
+    Linear given[3], before[3], earlier, beside[3], fresh[TORSIONS], hidden, logits;
     const float *torsion;           // (TORSIONS, WIDTH)
     const float *types, *distances; // (residues, WIDTH), and (HEADS, residues, residues) where `coupled`
     Block blocks[BLOCKS];
@@ -149,18 +149,23 @@ extern "C" void draw(
                 add(own, net.earlier, net, before(row, apart ? 1 : 2), r);
             }
         }
-        for (int turn = 0; turn < 1 + net.coupled; ++turn)
+        // Without coupling no residue sees another's new states, and all are drawn at once, a torsion after the other.
+        const int64_t parts = net.coupled ? n : 1;
+        for (int64_t part = 0; part < parts; ++part)
             for (int torsion = 0; torsion < TORSIONS; ++torsion) {
+                // Every other residue first.
+                const int64_t half = (n + 1) / 2, one = part < half ? 2 * part : 2 * (part - half) + 1;
                 items.clear();
                 for (int64_t row = 0; row < rows; ++row)
-                    for (int64_t r = turn; r < n; r += 1 + net.coupled) {
+                    for (int64_t r = net.coupled ? one : 0; r < (net.coupled ? one + 1 : n); ++r) {
                         if (!net.counts[r * TORSIONS + torsion]) continue;
                         const int64_t *fresh = before(row, 0);
                         float *own = &x[items.size() * WIDTH];
                         items.push_back(row * n + r);
                         for (int i = 0; i < WIDTH; ++i)
                             own[i] = h[row * wide + r * WIDTH + i] + net.torsion[torsion * WIDTH + i];
-                        for (int j = 1; j < 3 && turn; ++j) add(own, net.beside[j - 1], net, fresh, r + PLACES[j]);
+                        for (int j = 1; j < 3 && part >= half; ++j) add(own, net.beside[j - 1], net, fresh, r + PLACES[j]);
+                        if (net.coupled) add(own, net.beside[2], net, fresh, r - 2);
                         add(own, net.fresh[torsion], net, fresh, r, torsion);
                         for (int i = 0; i < WIDTH; ++i) own[i] = silu(own[i]);
                     }

@@ -41,7 +41,8 @@ class StateJumps(nn.Module):
     Of neighbours' types only levels are learned, which add up: else the network would know each pair of training.
 
     `coupled`, for trainings on many more sequences: neighbours' types count in full, attention over residues mixes what
-    the given frame tells, and every other residue sees the new states of those beside it, which are drawn first.
+    the given frame tells, every other residue sees the new states of those beside it, which are drawn first, and each
+    those of the residue two before it: turns of a helix come together.
     """
 
     def __init__(self, n_slots: int, n_types: int, *, coupled: bool = False) -> None:
@@ -70,14 +71,16 @@ class StateJumps(nn.Module):
             self.blocks = nn.ModuleList(ParallelBlock(_WIDTH, _COUPLED_HEADS) for _ in range(_COUPLED_BLOCKS))
             self.of_distance = nn.Embedding(2 * FAR + 1, _COUPLED_HEADS)
             self.of_new_beside = nn.ModuleList(nn.Linear(n_states, _WIDTH, bias=False) for _ in range(2))
+            self.of_new_two_before = nn.Linear(n_states, _WIDTH, bias=False)
             # Weights that are gone on from begin as they were.
-            for part in (*self.of_type_beside, *self.of_new_beside):
+            for part in (*self.of_type_beside, *self.of_new_beside, self.of_new_two_before):
                 nn.init.zeros_(cast(nn.Embedding | nn.Linear, part).weight)
+            self.register_load_state_dict_pre_hook(_knowing_two_before)
 
-    @property
-    def turns(self) -> tuple[slice, ...]:
+    def turns(self, n_residues: int) -> tuple[slice, ...]:
         """The residues whose new states are drawn at once, one part after the other."""
-        return (slice(0, None, 2), slice(1, None, 2)) if self.coupled else (slice(None),)
+        order = (*range(0, n_residues, 2), *range(1, n_residues, 2))
+        return tuple(slice(r, r + 1) for r in order) if self.coupled else (slice(None),)
 
     def of_observed(self, observed: Tensor, states: Tensor, places: Tensor, counts: Tensor) -> Tensor:
         """What all frames of a chunk have in common: `observed` (b, r, slots), its `states` (b, r, MOST_TORSIONS),
@@ -101,15 +104,17 @@ class StateJumps(nn.Module):
         return of_types + beside, self.of_distance(distances_along(len(places), places.device)).permute(2, 0, 1)
 
     def of_new_states(self, conditioning: Tensor) -> Tensor | float:
-        """What every other residue sees of the new states beside it: `conditioning` (b, t, r, n) of the new frame ->
-        (b, t, r, width), zero for the residues of the first turn."""
+        """What residues see of the new states of others: of the one two before, and every other residue of those beside
+        it: `conditioning` (b, t, r, n) of the new frame -> (b, t, r, width)."""
         if not self.coupled:
             return 0.0
         found: Tensor = sum(
             (of(x) for of, x in zip(self.of_new_beside, _beside(conditioning)[1:], strict=True)),
             conditioning.new_zeros(()),
         )
-        return found * (torch.arange(found.shape[-2], device=found.device) % 2)[:, None]
+        two_before = F.pad(conditioning, (0, 0, 2, 0))[..., : conditioning.shape[-2], :]
+        second = (torch.arange(found.shape[-2], device=found.device) % 2)[:, None]
+        return found * second + self.of_new_two_before(two_before)
 
     def of_times_alone(
         self, times_ps: Tensor, apart_ps: Tensor, places: Tensor, counts: Tensor
@@ -216,15 +221,17 @@ class StateJumps(nn.Module):
             # A residue's torsion in each state, as `conditioning_states` has it.
             ones = torch.eye(MOST_STATES, device=counts.device) * (counts > 0)[..., None, None]
             residues, most = torch.arange(len(counts), device=counts.device), (counts - 1).clamp(min=0)
-            turns = [(part, torch.nonzero((counts[part] > 0).any(0))[:, 0].tolist()) for part in self.turns]
+            turns = [
+                (part, torch.nonzero((counts[part] > 0).any(0))[:, 0].tolist()) for part in self.turns(len(counts))
+            ]
             now, found = states[:, None], []
             before = conditioning = conditioning_states(now, counts)
             for k in range(times_ps.shape[1]):
                 at = slice(k, k + 1)
                 h = self.of_frames(conditioning, before) + common[:, at]
                 new, before, conditioning = torch.zeros_like(now), conditioning, torch.zeros_like(conditioning)
-                for turn, (part, torsions) in enumerate(turns):
-                    seen = (h + self.of_new_states(conditioning) if turn else h)[..., part, :]
+                for part, torsions in turns:
+                    seen = (h + self.of_new_states(conditioning))[..., part, :]
                     for torsion in torsions:
                         logits = self.probabilities(
                             torsion, seen, levels[:, at, :, part], now[..., part, torsion], conditioning[..., part, :]
@@ -264,7 +271,7 @@ class StateJumps(nn.Module):
         net.torsion, net.types = at(self.of_torsion.weight), at(of_types)
         if distances is not None:
             net.distances = at(distances)
-            net.beside[:] = [linear(layer) for layer in self.of_new_beside]
+            net.beside[:] = [linear(layer) for layer in (*self.of_new_beside, self.of_new_two_before)]
             for k, block in enumerate(cast(list[ParallelBlock], list(self.blocks))):
                 parts = block.proj_in, block.attention_out, block.mlp_out
                 net.blocks[k] = _Block(at(block.offset), *(linear(part) for part in parts))
@@ -290,10 +297,16 @@ class _Block(ctypes.Structure):
 class _Net(ctypes.Structure):
     _fields_ = [
         ("n_residues", ctypes.c_int64), ("coupled", ctypes.c_int64), ("counts", ctypes.c_void_p),
-        ("given", 3 * _Linear), ("before", 3 * _Linear), ("earlier", _Linear), ("beside", 2 * _Linear),
+        ("given", 3 * _Linear), ("before", 3 * _Linear), ("earlier", _Linear), ("beside", 3 * _Linear),
         ("fresh", MOST_TORSIONS * _Linear), ("hidden", _Linear), ("logits", _Linear),
         *((name, ctypes.c_void_p) for name in ("torsion", "types", "distances")), ("blocks", _COUPLED_BLOCKS * _Block),
     ]  # fmt: skip
+
+
+def _knowing_two_before(net: nn.Module, state: dict[str, Tensor], prefix: str, *_: object) -> None:
+    """Weights from before `of_new_two_before` know nothing of it."""
+    name = "of_new_two_before.weight"
+    state.setdefault(prefix + name, torch.zeros_like(net.get_parameter(name)))
 
 
 @cache

@@ -79,6 +79,25 @@ def test_of_frames_far_apart_each_follows_from_the_states_before_alone(
         assert torch.equal(whole[:, 3:], rest) == same
 
 
+@pytest.mark.parametrize("by_torch", [True, False])
+def test_states_of_residues_two_apart_are_drawn_together(monkeypatch: pytest.MonkeyPatch, by_torch: bool) -> None:
+    """Also the first to be drawn; weights from before have them independent."""
+    if by_torch:
+        _by_torch(monkeypatch)
+    net, rows, psi = _lively(coupled=True), 4000, 1
+    counts = _COUNTS[[1, 1, 1]]
+    net.of_new_two_before.weight.copy_(60.0 * net.of_new_beside[0].weight)
+    state = {name: x for name, x in net.state_dict().items() if "two_before" not in name}
+    before = StateJumps(6, 4, coupled=True).requires_grad_(False)
+    before.load_state_dict(state)
+    generator = torch.Generator().manual_seed(2)
+    uniform, time = torch.rand(rows, 1, *counts.shape, generator=generator), torch.full((rows, 1), 10.0)
+    given = torch.zeros(rows, 3, 6), torch.zeros(rows, *counts.shape, dtype=torch.long), _PLACES[:3], counts, time, time
+    together, apart = (of.draw(*given, uniform)[:, 0, [0, 2], psi].float() for of in (net, before))
+    assert abs(float(torch.corrcoef(together.T)[0, 1])) > 0.3
+    assert abs(float(torch.corrcoef(apart.T)[0, 1])) < 0.05
+
+
 def _shipped(solvent: str) -> PeptideSlide:
     weights = load_weights(weights_path("peptides"))
     model = under_conditions(weights, {"solvent": solvent}).model.at_lag(1000.0)
