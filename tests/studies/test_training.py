@@ -405,6 +405,9 @@ def test_steps_are_taught_to_keep_what_is_drawn_at_endless_times(
     with torch.no_grad():
         other.jumps.of_change[0, :, 1, 0, 1] += 1.3
         other.jumps.of_change[0, :, 1, 1, 0] -= 1.3
+        # By steps of 10 ps phi > 0 is too frequent, not at endless times.
+        other.jumps.of_change[1, :, 0, 0, 1] -= 0.3
+        other.jumps.of_change[0, :, 0, 0, 1] += 0.3 * math.log10(begun.config.forgotten_ps)
     provenance = {"umbrella_states": 5}
     save_weights(source := tmp_path / "other.safetensors", other, shipped.domain, provenance, half=True)
     found = load_weights(teach(shipped.path, tmp_path / "taught.safetensors", 1, 100, source))
@@ -420,7 +423,7 @@ def test_steps_are_taught_to_keep_what_is_drawn_at_endless_times(
         found = step(model, begun, frames, rows, torch.tensor([time_ps]), generator)
         return float(found.unbalanced[:, which].mean()), float(found.faster[:, which].mean())
 
-    assert of(psi, begun, 10.0)[0] < -0.8 and of(phi, begun, 10.0)[0] < -1.0
+    assert of(psi, begun, 10.0)[0] < -0.8 and of(phi, other, 10.0)[0] > 0.8
     for which in (phi, psi):
         assert abs(of(which, taught, 10.0)[0]) < 0.3 and abs(of(which, taught, 10.0)[1]) < 0.3
     endless = begun.config.forgotten_ps
