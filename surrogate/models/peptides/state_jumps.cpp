@@ -164,7 +164,8 @@ extern "C" void draw(
                         items.push_back(row * n + r);
                         for (int i = 0; i < WIDTH; ++i)
                             own[i] = h[row * wide + r * WIDTH + i] + net.torsion[torsion * WIDTH + i];
-                        for (int j = 1; j < 3 && part >= half; ++j) add(own, net.beside[j - 1], net, fresh, r + PLACES[j]);
+                        for (int j = 1; j < 3 && part >= half; ++j)
+                            add(own, net.beside[j - 1], net, fresh, r + PLACES[j]);
                         if (net.coupled) add(own, net.beside[2], net, fresh, r - 2);
                         add(own, net.fresh[torsion], net, fresh, r, torsion);
                         for (int i = 0; i < WIDTH; ++i) own[i] = silu(own[i]);
