@@ -16,7 +16,20 @@ from peptide_campaign import light_umbrella
 from peptide_energies import trained_with
 from peptide_equilibrium import Equilibrium
 from peptide_list import held_out_peptides, training_peptides, unseen_peptides, wide_peptides
-from peptide_states import DRAWS, Md, drawn, errors, gather, parted, positive_phi_errors, read, shares, teach, together
+from peptide_states import (
+    DRAWS,
+    Md,
+    correlations,
+    drawn,
+    errors,
+    gather,
+    parted,
+    positive_phi_errors,
+    read,
+    shares,
+    teach,
+    together,
+)
 
 from md_reference.forces.umbrella import Umbrella
 from surrogate.models.architecture import weights_path
@@ -151,8 +164,11 @@ def test_psi_two_apart_that_turn_together_and_a_positive_phi_that_is_too_rare_ar
     states[0, :, at[2, 0]] = 1
     states[0, :, at[3, 1]] = states[0, :, at[1, 1]]
     states[..., at[2, 1]] = rng.random((2, DRAWS)) < 0.5
-    found = together(Md("ALA-SER-LEU", states).laid(chain), chain)
+    md = Md("ALA-SER-LEU", states)
+    found = together(md.laid(chain), chain)
     assert found[2] == pytest.approx([0.8], abs=0.04) and found[1] == pytest.approx([0.0, 0.0], abs=0.06)
+    of_two = correlations(model, [(md, Equilibrium.of(model, md.sequence, n_frames=100))])[2]
+    assert of_two[1] == pytest.approx(found[2][0]) and abs(of_two[0]) < 0.3
     energies = {"SER": trained_with(start.provenance)["SER"]}
     usual = positive_phi_errors(model, energies)
     with torch.no_grad():

@@ -151,28 +151,39 @@ def together(states: Tensor, chain: ChainFeatures) -> dict[int, list[float]]:
 
 
 @torch.no_grad()
+def endless_states(model: PeptideSlide, frames: Equilibrium) -> Tensor:
+    """Return states `(2 DRAWS, n_residues, MOST_TORSIONS)` endless times after frames."""
+    chain, generator = frames.chain, torch.Generator().manual_seed(0)
+    rows = torch.multinomial(frames.weights, 2 * DRAWS, True, generator=generator)
+    times = torch.full((2 * DRAWS, 1), model.config.forgotten_ps)
+    uniform = torch.rand(len(rows), 1, *chain.stated.counts.shape, generator=generator)
+    given = frames.observed[rows], frames.states[rows], chain.places, chain.stated.counts, times, times
+    return model.jumps_of(chain).draw(*given, uniform)[:, 0]
+
+
 def errors(model: PeptideSlide, some: Iterable[tuple[Md, Equilibrium]]) -> dict[str, float]:
     """Return how far shares of states at endless times are from MD's, root mean square less MD's own error, and that
-    error, %; and the mean correlations of `together`, ours and MD's, nan where no two residues are so far apart."""
+    error, %."""
     off, own, n = 0.0, 0.0, 0
-    both: dict[str, list[float]] = {f"{whose} {apart}": [] for apart in _APART for whose in ("ours", "MD's")}
     for md, frames in some:
-        chain, generator = frames.chain, torch.Generator().manual_seed(0)
-        rows = torch.multinomial(frames.weights, 2 * DRAWS, True, generator=generator)
-        times = torch.full((2 * DRAWS, 1), model.config.forgotten_ps)
-        uniform = torch.rand(len(rows), 1, *chain.stated.counts.shape, generator=generator)
-        given = frames.observed[rows], frames.states[rows], chain.places, chain.stated.counts, times, times
-        drawn_states = model.jumps_of(chain).draw(*given, uniform)[:, 0]
-        for whose, states in (("ours", drawn_states), ("MD's", md.laid(chain))):
-            for apart, found in together(states, chain).items():
-                both[f"{whose} {apart}"] += found
-        ours = shares(drawn_states, chain)
+        chain = frames.chain
+        ours = shares(endless_states(model, frames), chain)
         first, second = (shares(x, chain) for x in md.laid(chain).split(DRAWS))
         off += float((ours - (first + second) / 2).square().sum())
         own += float((first - second).square().sum()) / 4
         n += int(chain.stated.counts[chain.stated.counts > 0].sum()) - 2 * int((chain.stated.slot == 0).sum())
-    correlations = {name: float(np.mean(x)) if x else math.nan for name, x in both.items()}
-    return {"off": 100.0 * math.sqrt(max(0.0, off - own) / n), "own": 100.0 * math.sqrt(own / n), **correlations}
+    return {"off": 100.0 * math.sqrt(max(0.0, off - own) / n), "own": 100.0 * math.sqrt(own / n)}
+
+
+def correlations(model: PeptideSlide, some: Iterable[tuple[Md, Equilibrium]]) -> dict[int, tuple[float, float]]:
+    """Return the mean correlations of `together`, ours at endless times and MD's, by how far residues are apart; those
+    alone that some molecule has."""
+    each: dict[int, list[tuple[float, float]]] = {apart: [] for apart in _APART}
+    for md, frames in some:
+        ours, theirs = (together(x, frames.chain) for x in (endless_states(model, frames), md.laid(frames.chain)))
+        for apart, found in each.items():
+            found += zip(ours[apart], theirs[apart], strict=True)
+    return {apart: (float(np.mean(x, 0)[0]), float(np.mean(x, 0)[1])) for apart, x in each.items() if x}
 
 
 def positive_phi_errors(model: PeptideSlide, energies: dict[str, float]) -> dict[str, tuple[float, float]]:
@@ -189,9 +200,7 @@ def positive_phi_errors(model: PeptideSlide, energies: dict[str, float]) -> dict
                 for side, x in ((~positive, after), (positive, 1.0 - after))
             )
             off[f"{time_ps:g} ps"].append(float((left / entered).log()) - kt)
-    return {
-        name: (float(np.nanmean(x)), float(np.sqrt(np.nanmean(np.square(x))))) for name, x in off.items()
-    }  # fmt: skip
+    return {name: (float(np.nanmean(x)), float(np.sqrt(np.nanmean(np.square(x))))) for name, x in off.items()}
 
 
 def parted(some: Sequence[Md]) -> tuple[list[Md], list[Md]]:
@@ -285,11 +294,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
         for name, part in zip(("left out", "learned"), reversed(parted(read())), strict=True):
             for kind in sorted({md.kind for md in part}, reverse=True):
                 some = [md for md in part if md.kind == kind]
-                found = errors(model, ((md, Equilibrium.of(model, md.sequence, n_frames=_STARTS)) for md in some))
+                each = [(md, Equilibrium.of(model, md.sequence, n_frames=_STARTS)) for md in some]
+                found = errors(model, each)
                 off, own = found["off"], found["own"]
                 line = f"{len(some)} {kind} {name}: off by {off:.1f} %, MD's error {own:.1f} %"
-                for apart in _APART:
-                    ours, theirs = (found[f"{whose} {apart}"] for whose in ("ours", "MD's"))
+                for apart, (ours, theirs) in correlations(model, each).items():
                     line += f"; psi {apart} apart correlate {ours:.3f}, MD's {theirs:.3f}"
                 sys.stdout.write(line + "\n")
                 sys.stdout.flush()
